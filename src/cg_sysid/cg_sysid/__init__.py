@@ -1,0 +1,1 @@
+"""System identification and diagnosis: recordings, checks, fits and reports."""
