@@ -1,0 +1,1 @@
+"""The robots as data: model files, visual description and layouts."""

@@ -1,0 +1,1 @@
+"""The model: rigid bodies, effects, impact, linearisation, compiled functions, simulation."""

@@ -1,0 +1,209 @@
+"""From mechanism, effects and set-up to one set of equations: dx/dt = f(x, u, p), y = h(x, u, p).
+
+x = (s, ds/dt, z): free coordinates, their rates, extra states of the effects. The parameter
+vector p is the mechanism's parameters, then those of each effect, then those of the springs.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.effects import Body, Effect
+from cg_dynamics.lagrange import manipulator, solve_small
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The assembled model in symbols.
+
+    Attributes:
+        x: State, shape (nx, 1).
+        u: Inputs as the drive reports them, shape (nu, 1), in N m.
+        p: Parameters, shape (np, 1).
+        rates: dx/dt.
+        outputs: What the sensors report, before any delay, shape (ny, 1).
+        initial: x at the start, given (s, ds/dt) in the first entries of x and the held u.
+        input_delay: Delay of the inputs in s.
+        output_delays: Delay of each output in s, shape (ny, 1).
+        mass_matrix: Of the free coordinates.
+        energy: Kinetic plus potential energy of bodies and springs in J.
+        state_names: Names of x.
+        parameter_names: Full names of p.
+        channels: Output channels, the order of `outputs`.
+        coordinates: Number m of free coordinates.
+        largest_step: Longest step in s at which every effect is simulated well.
+    """
+
+    x: ca.SX
+    u: ca.SX
+    p: ca.SX
+    rates: ca.SX
+    outputs: ca.SX
+    initial: ca.SX
+    input_delay: ca.SX
+    output_delays: ca.SX
+    mass_matrix: ca.SX
+    energy: ca.SX
+    state_names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    channels: tuple[str, ...]
+    coordinates: int
+    largest_step: float
+
+
+def acting_effects(model: Model) -> tuple[Effect, ...]:
+    """The effects of a model that are not at their neutral value."""
+    values = model.values
+    return tuple(
+        effect
+        for effect in model.effects
+        if effect.acts({p.name: values[f'{effect.label}.{p.name}'] for p in effect.parameters})
+    )
+
+
+def parameter_names(model: Model, setup: Setup) -> tuple[str, ...]:
+    """Full names of the parameter vector of a model in a set-up."""
+    springs = (
+        f'spring{i}.{field}' for i in range(len(setup.springs)) for field in SPRING_FIELDS
+    )
+    return (*model.declarations, *springs)
+
+
+def parameter_vector(model: Model, setup: Setup) -> np.ndarray:
+    """Values of the parameter vector, SI units."""
+    springs = [
+        value
+        for spring in setup.springs
+        for value in (spring.point, *spring.anchor, spring.stiffness, spring.free_length)
+    ]
+    values = model.values
+    return np.array([*(values[name] for name in model.declarations), *springs], dtype=float)
+
+
+def assemble(model: Model, setup: Setup) -> Equations:
+    """Build the equations of a model in a set-up; only acting effects take part."""
+    mechanism = model.mechanism
+    names = parameter_names(model, setup)
+    p = ca.SX.sym('p', len(names))
+    by_name = dict(zip(names, ca.vertsplit(p), strict=True))
+    effects = acting_effects(model)
+    own = {
+        effect.label: {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
+        for effect in effects
+    }
+    kinematics = mechanism.kinematics(setup)
+    m = len(kinematics.names)
+    extra = [f'{effect.label}.{state}' for effect in effects for state in effect.states]
+    x = ca.SX.sym('x', 2 * m + len(extra))
+    s, ds = x[:m], x[m : 2 * m]
+    z = dict(zip(extra, ca.vertsplit(x[2 * m :]), strict=True)) if extra else {}
+    z_of = {e.label: [z[f'{e.label}.{state}'] for state in e.states] for e in effects}
+    dz: dict[str, list[ca.SX]] = {}
+    u = ca.SX.sym('u', len(mechanism.inputs))
+
+    def pass_through(effect, result):
+        value, rates = result
+        if rates:
+            dz[effect.label] = rates
+        return value
+
+    # Torque path: what the drive reports -> motor -> transmission -> joint.
+    torques, starts = [], {}
+    for joint, row, reported in zip(
+        mechanism.joints, mechanism.joints.values(), ca.vertsplit(u), strict=True
+    ):
+        here = [e for e in effects if e.site == joint or e.site == 'all']
+        joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
+        angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
+        load = reported
+        for hook in ('deliver', 'transmit', 'joint_torque'):
+            added = 0
+            for e in here:
+                if not overrides(e, hook):
+                    continue
+                if e.states:
+                    starts[e.label] = e.initial_states(angle, rate, load, own[e.label])
+                zs, ps = z_of[e.label], own[e.label]
+                if hook == 'deliver':
+                    load = pass_through(e, e.deliver(load, zs, ps))
+                elif hook == 'transmit':
+                    load = pass_through(e, e.transmit(load, angle, rate, zs, ps))
+                else:
+                    added += pass_through(e, e.joint_torque(angle, rate, load, zs, ps))
+            load = load + added
+        torques.append(load)
+
+    # Bodies: energies, springs, forces.
+    q, v = ca.SX.sym('q', kinematics.basis.shape[0]), ca.SX.sym('v', kinematics.basis.shape[0])
+    up = ca.SX([0, 1])
+    for e in effects:
+        up = e.up(up, own[e.label])
+    body = Body(mechanism, setup, q, v, by_name, up)
+    kinetic, potential = mechanism.energies(q, v, by_name, setup, up)
+    for i, spring in enumerate(setup.springs):
+        numbers = {field: by_name[f'spring{i}.{field}'] for field in SPRING_FIELDS}
+        end, _ = body.point(spring.body, numbers['point'])
+        reach = end - ca.vertcat(numbers['anchor_x'], numbers['anchor_z'])
+        stretch = ca.sqrt(ca.sumsqr(reach)) - numbers['free_length']
+        potential += numbers['stiffness'] * stretch**2 / 2
+    force = ca.SX.zeros(q.shape)
+    for e in effects:
+        more_kinetic, more_potential = e.energies(body, own[e.label])
+        kinetic, potential = kinetic + more_kinetic, potential + more_potential
+        force += e.force(body, own[e.label])
+    for row, torque in zip(mechanism.joints.values(), torques, strict=True):
+        force += ca.DM(row) * torque
+    full = [ca.mtimes(kinematics.basis, s), ca.mtimes(kinematics.basis, ds)]
+    kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
+    mass_matrix, bias = manipulator(kinetic, potential, s, ds)
+    acceleration = solve_small(mass_matrix, ca.mtimes(kinematics.basis.T, force) - bias)
+
+    # Sensors.
+    outputs = mechanism.sensors(*full)
+    for e in effects:
+        if overrides(e, 'read'):
+            if e.states:
+                starts[e.label] = e.initial_states(outputs[e.site], ca.SX(0), ca.SX(0), own[e.label])
+            outputs = pass_through(e, e.read(outputs, z_of[e.label], own[e.label]))
+
+    input_delay = ca.SX(0)
+    output_delays = {channel: ca.SX(0) for channel in outputs}
+    for e in effects:
+        delay = e.input_delay(own[e.label])
+        input_delay += 0 if delay is None else delay
+        for channel in outputs:
+            late = e.output_delay(channel, own[e.label])
+            output_delays[channel] += 0 if late is None else late
+    rates = [dz[e.label] for e in effects if e.states]
+    initial = [starts[e.label] for e in effects if e.states]
+    return Equations(
+        x=x,
+        u=u,
+        p=p,
+        rates=ca.vertcat(ds, acceleration, *(r for group in rates for r in group)),
+        outputs=ca.vertcat(*outputs.values()),
+        initial=ca.vertcat(s, ds, *(r for group in initial for r in group)),
+        input_delay=input_delay,
+        output_delays=ca.vertcat(*output_delays.values()),
+        mass_matrix=mass_matrix,
+        energy=kinetic + potential,
+        state_names=(
+            *kinematics.names,
+            *(f'd{name}/dt' for name in kinematics.names),
+            *extra,
+        ),
+        parameter_names=names,
+        channels=tuple(outputs),
+        coordinates=m,
+        largest_step=min((e.largest_step for e in effects), default=float('inf')),
+    )
+
+
+def overrides(effect: Effect, hook: str) -> bool:
+    """True if an effect does something at that place."""
+    return getattr(type(effect), hook) is not getattr(Effect, hook)

@@ -1,0 +1,412 @@
+"""Compiled models: CasADi expressions to C, built once, cached by content, called on arrays.
+
+The generated functions and rollout.c become one shared library per model structure and set-up;
+parameter values are arguments, so a fit never compiles. Where no C compiler is found the same
+interface runs on CasADi's virtual machine (fallback.py), slower, and says so once.
+"""
+
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+log = logging.getLogger(__name__)
+
+# No -ffast-math: runaway states are found by comparisons that must see NaN.
+FLAGS = (
+    '-O2', '-ftree-vectorize', '-march=native', '-fno-math-errno', '-fno-trapping-math',
+    '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math', '-ffp-contract=fast',
+    '-shared', '-fPIC',
+)  # fmt: skip
+MAX_COLUMNS = 64
+REFERENCE_STEP = 0.002
+
+
+def cache_directory() -> Path:
+    """Where compiled models are kept; CG_CACHE overrides the user's cache directory."""
+    default = Path(os.environ.get('XDG_CACHE_HOME', Path.home() / '.cache')) / 'compass_gait'
+    return Path(os.environ.get('CG_CACHE', default))
+
+
+@functools.cache
+def compiler() -> str | None:
+    """Path of a C compiler, or None; CG_COMPILER overrides, empty means none."""
+    named = os.environ.get('CG_COMPILER')
+    if named is not None:
+        return shutil.which(named) if named else None
+    return next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of one record: see cgm_normal in rollout.c.
+
+    Attributes:
+        hessian: Sum of J'WJ, shape (nc, nc).
+        gradient: Sum of J'Wr, shape (nc,).
+        sse: Weighted squared error of each output, shape (ny,).
+        count: Samples of each output, shape (ny,).
+        rows: Rows simulated before the state ran away.
+    """
+
+    hessian: np.ndarray
+    gradient: np.ndarray
+    sse: np.ndarray
+    count: np.ndarray
+    rows: int
+
+
+class CompiledModel:
+    """A model structure in a set-up, as numeric functions of state, inputs and parameters.
+
+    Attributes:
+        equations: The symbolic equations.
+        free: Names of the parameters with sensitivities, in the order of `column`.
+    """
+
+    def __init__(self, equations: Equations, free: tuple[str, ...], library: Path | None):
+        self.equations = equations
+        self.free = free
+        self.state_names = equations.state_names
+        self.parameter_names = equations.parameter_names
+        self.channels = equations.channels
+        self.nx, self.nu = equations.x.shape[0], equations.u.shape[0]
+        self.np, self.ny = equations.p.shape[0], equations.outputs.shape[0]
+        e = equations
+        self.largest_step = min(e.largest_step, REFERENCE_STEP)
+        free_symbols = _pick(e, free)
+        delays = ca.vertcat(e.input_delay, e.output_delays)
+        self._delays = ca.Function('delays', [e.p], [delays, ca.jacobian(delays, free_symbols)])
+        self._initial = ca.Function(
+            'initial',
+            [e.x, e.u, e.p],
+            [e.initial, ca.jacobian(e.initial, e.x), ca.jacobian(e.initial, free_symbols)],
+        )
+        self.f = ca.Function('f', [e.x, e.u, e.p], [e.rates], ['x', 'u', 'p'], ['dx'])
+        self.h = ca.Function('h', [e.x, e.u, e.p], [e.outputs], ['x', 'u', 'p'], ['y'])
+        self.has_delays = not delays.is_zero()
+        if library is None:
+            from cg_dynamics.fallback import InterpretedRollout
+
+            self._c = InterpretedRollout(equations, free)
+        else:
+            self._c = _bind(library)
+
+    def delays(self, p: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Input delay in s, output delays in s (ny,), and their Jacobian (1 + ny, nf)."""
+        if not self.has_delays:
+            return 0.0, np.zeros(self.ny), np.zeros((1 + self.ny, len(self.free)))
+        values, jacobian = self._delays(p)
+        values = np.asarray(values).ravel()
+        return float(values[0]), values[1:], np.asarray(jacobian)
+
+    def initial_state(self, motion: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Full state at the start, extra states settled: shape (nx,).
+
+        Args:
+            motion: Free coordinates and their rates, shape (2 m,).
+            u: Inputs held at the start, shape (nu,).
+            p: Parameter vector.
+        """
+        return self.initial_sensitivity(motion, u, p)[0]
+
+    def initial_sensitivity(self, motion, u, p) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `initial_state`, with d/d(motion) (nx, 2m) and d/d(free) (nx, nf)."""
+        m2 = 2 * self.equations.coordinates
+        if self.nx == m2:
+            return np.array(motion, float), np.eye(m2), np.zeros((m2, len(self.free)))
+        x = np.zeros(self.nx)
+        x[:m2] = motion
+        full, by_x, by_p = self._initial(x, u, p)
+        return np.asarray(full).ravel(), np.asarray(by_x)[:, :m2], np.asarray(by_p)
+
+    def delayed_inputs(
+        self, time: np.ndarray, u: np.ndarray, delay: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean of u(t - delay) over each row's interval, and its derivative by the delay.
+
+        Args:
+            time: Stamps of the rows in s, shape (n,).
+            u: Held inputs, shape (n, nu). Before the first row the first value counts.
+            delay: In s.
+        """
+        if not self.has_delays:
+            return u, np.zeros_like(u)
+        dt = np.diff(time)
+        edges = time - delay
+        row = np.clip(np.searchsorted(time, edges, side='right') - 1, 0, len(time) - 1)
+        held = u[row]
+        area = np.vstack([np.zeros(u.shape[1]), np.cumsum(u[:-1] * dt[:, None], axis=0)])
+        integral = area[row] + held * (edges - time[row])[:, None]
+        mean, slope = u.copy(), np.zeros_like(u)
+        mean[:-1] = np.diff(integral, axis=0) / dt[:, None]
+        slope[:-1] = -np.diff(held, axis=0) / dt[:, None]
+        return mean, slope
+
+    def simulate(
+        self, time: np.ndarray, u: np.ndarray, x0: np.ndarray, p: np.ndarray
+    ) -> np.ndarray:
+        """States at the rows, shape (n, nx), from x0 under held inputs.
+
+        Args:
+            time: Stamps in s, increasing, shape (n,).
+            u: Inputs, each held until the next row, shape (n, nu), N m.
+            x0: State at the first row, shape (nx,).
+            p: Parameter vector (assemble.parameter_vector), shape (np,).
+
+        Raises:
+            SimulationError: if the state runs away.
+        """
+        time, u, x0, p = (_array(a) for a in (time, u, x0, p))
+        late, _ = self.delayed_inputs(time, u, self.delays(p)[0])
+        late = _array(late)
+        states = np.empty((len(time), self.nx))
+        rows = self._c.cgm_simulate(
+            len(time), _array(np.diff(time)), self.largest_step, late, x0, p, states
+        )
+        if rows < len(time):
+            raise SimulationError(
+                f'the state runs away after {time[rows - 1] - time[0]:.3f} s', time[rows - 1]
+            )
+        return states
+
+    def outputs(
+        self, time: np.ndarray, u: np.ndarray, states: np.ndarray, p: np.ndarray
+    ) -> np.ndarray:
+        """What the sensors report at the rows, shape (n, ny), delays included."""
+        time, u, states, p = (_array(a) for a in (time, u, states, p))
+        input_delay, output_delays, _ = self.delays(p)
+        late = _array(self.delayed_inputs(time, u, input_delay)[0])
+        y = np.empty((len(time), self.ny))
+        self._c.cgm_outputs(len(time), time, late, p, states, _array(output_delays), y)
+        return y
+
+    def advance(self, x: np.ndarray, u: np.ndarray, p: np.ndarray, step: float, n: int) -> None:
+        """Integrate x in place over n Runge-Kutta steps of `step` s with inputs held."""
+        self._c.cgm_advance(x, u, p, step, n)
+
+    def normal(
+        self,
+        time: np.ndarray,
+        u: np.ndarray,
+        x0: np.ndarray,
+        s0: np.ndarray,
+        p: np.ndarray,
+        column: np.ndarray,
+        measured: np.ndarray,
+        weight: np.ndarray,
+        keep: bool = False,
+    ) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
+        """Normal equations of the simulation error of one record (Eq. 4.13).
+
+        Args:
+            time: Stamps of the rows in s, shape (n,).
+            u: Held inputs, shape (n, nu).
+            x0: Initial state, shape (nx,).
+            s0: Its derivative by the columns, shape (nx, nc).
+            p: Parameter vector, shape (np,).
+            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
+            measured: Outputs, NaN where there is no sample, shape (n, ny).
+            weight: 1 / standard deviation of each output, shape (ny,).
+            keep: Return the simulated outputs and the Jacobian too.
+        """
+        time, u, x0, s0, p = (_array(a) for a in (time, u, x0, s0, p))
+        n, nc = len(time), s0.shape[1]
+        if nc > MAX_COLUMNS:
+            raise ValueError(f'{nc} unknowns in one record; at most {MAX_COLUMNS}')
+        input_delay, output_delays, jacobian = self.delays(p)
+        late, slope = self.delayed_inputs(time, u, input_delay)
+        column = np.ascontiguousarray(column, dtype=np.int32)
+        delay_columns = [_delay_column(row, column) for row in jacobian]
+        any_late = self.has_delays and (output_delays.any() or max(delay_columns[1:]) >= 0)
+        history = np.empty(n * 2 * self.nx * (1 + nc) if any_late else 1)
+        normal = Normal(
+            np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0
+        )
+        y = np.full((n, self.ny), np.nan) if keep else None
+        j = np.zeros((n, self.ny, nc)) if keep else None
+        rows = self._c.cgm_normal(
+            n, time, self.largest_step, _array(late), _array(slope), delay_columns[0], x0, s0, p,
+            nc, column, _array(measured), _array(weight), _array(output_delays),
+            np.array(delay_columns[1:], dtype=np.int32), history,
+            normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
+        )  # fmt: skip
+        object.__setattr__(normal, 'rows', rows)
+        return normal, y, j
+
+
+def compile_model(model: Model, setup: Setup, free: tuple[str, ...] | None = None) -> CompiledModel:
+    """The compiled form of a model's structure in a set-up; quick when it was built before.
+
+    Args:
+        model: Its structure counts, its values do not (but for effects at neutral).
+        setup: Its structure counts: stance, fixture, number and bodies of springs.
+        free: Parameters with sensitivities; by default all that are declared free.
+    """
+    if free is None:
+        acting = {effect.label for effect in acting_effects(model)}
+        free = tuple(
+            name
+            for name, parameter in model.declarations.items()
+            if parameter.free and ('.' not in name or name.rpartition('.')[0] in acting)
+        )
+    key = (
+        model.mechanism.name,
+        tuple((e.name, e.at) for e in model.effects),
+        tuple(e.label for e in acting_effects(model)),
+        setup.stance,
+        setup.fixture,
+        tuple(spring.body for spring in setup.springs),
+        free,
+    )
+    if key not in _built:
+        _built[key] = _build(model, setup, free)
+    return _built[key]
+
+
+_built: dict[tuple, CompiledModel] = {}
+
+
+def simulate(
+    model: Model, setup: Setup, time: np.ndarray, u: np.ndarray, motion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, nx) and outputs (n, ny) of a model from its initial motion (2m,)."""
+    compiled, p = compile_model(model, setup), parameter_vector(model, setup)
+    x0 = compiled.initial_state(motion, u[0], p)
+    states = compiled.simulate(time, u, x0, p)
+    return states, compiled.outputs(time, u, states, p)
+
+
+def _array(a) -> np.ndarray:
+    return np.ascontiguousarray(a, dtype=float)
+
+
+def _pick(equations: Equations, names: tuple[str, ...]) -> ca.SX:
+    where = [equations.parameter_names.index(name) for name in names]
+    return ca.vertcat(*(equations.p[i] for i in where)) if where else ca.SX(0, 1)
+
+
+def _delay_column(row: np.ndarray, column: np.ndarray) -> int:
+    # A delay is the sum of delays of effects; two of them on one path are not told apart here.
+    active = [int(c) for value, c in zip(row, column, strict=True) if value != 0 and c >= 0]
+    return active[0] if active else -1
+
+
+def _build(model: Model, setup: Setup, free: tuple[str, ...]) -> CompiledModel:
+    equations = assemble(model, setup)
+    gcc = compiler()
+    if gcc is None:
+        log.warning('no C compiler found: models run on the CasADi virtual machine, slower')
+        return CompiledModel(equations, free, None)
+    source = _source(equations, free)
+    key = '\n'.join([source, *FLAGS, gcc, platform.machine(), _cpu()])
+    target = cache_directory() / f'{hashlib.sha256(key.encode()).hexdigest()[:32]}.so'
+    if not target.exists():
+        _compile(source, target, gcc)
+    return CompiledModel(equations, free, target)
+
+
+@functools.cache
+def _cpu() -> str:
+    # A cache on a shared home must not hand one machine the other's instructions.
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith('flags')), '')
+
+
+def _source(e: Equations, free: tuple[str, ...]) -> str:
+    symbols = _pick(e, free)
+    arguments = [e.x, e.u, e.p]
+
+    def dense(matrix):  # row-major
+        return ca.densify(matrix).T
+
+    def function(name, *results):
+        return ca.Function(name, arguments, list(ca.cse([ca.densify(r) for r in results])))
+
+    functions = [
+        function('cgm_f', e.rates),
+        function(
+            'cgm_fs',
+            e.rates,
+            dense(ca.jacobian(e.rates, e.x)),
+            dense(ca.jacobian(e.rates, e.u)),
+            dense(ca.jacobian(e.rates, symbols)),
+        ),
+        function('cgm_h', e.outputs),
+        function(
+            'cgm_hs',
+            e.outputs,
+            dense(ca.jacobian(e.outputs, e.x)),
+            dense(ca.jacobian(e.outputs, symbols)),
+        ),
+    ]
+    generator = ca.CodeGenerator('cgm', {'with_header': False})
+    for item in functions:
+        generator.add(item)
+    sizes = {
+        'NX': e.x.shape[0],
+        'NU': e.u.shape[0],
+        'NP': e.p.shape[0],
+        'NF': len(free),
+        'NY': e.outputs.shape[0],
+        'W': max(item.sz_w() for item in functions) + 1,
+    }
+    defines = '\n'.join(f'#define {name} {value}' for name, value in sizes.items())
+    runtime = (Path(__file__).parent / 'rollout.c').read_text()
+    return '\n'.join([generator.dump(), defines, runtime])
+
+
+def _compile(source: str, target: Path, gcc: str) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as directory:
+        c, so = Path(directory) / 'model.c', Path(directory) / 'model.so'
+        c.write_text(source)
+        result = subprocess.run(
+            [gcc, *FLAGS, '-o', str(so), str(c), '-lm'], capture_output=True, text=True
+        )
+        if result.returncode:
+            raise RuntimeError(f'{gcc} failed on a generated model:\n{result.stderr[:2000]}')
+        # Two processes may build the same model; the last rename wins and both are equal.
+        os.replace(so, target)
+
+
+def _bind(library: Path) -> ctypes.CDLL:
+    loaded = ctypes.CDLL(str(library))
+    number, count = ctypes.c_double, ctypes.c_int
+    array = np.ctypeslib.ndpointer(float, flags='C')
+    whole = np.ctypeslib.ndpointer(np.int32, flags='C')
+
+    class OptionalArray(array):  # type: ignore[misc, valid-type]
+        @classmethod
+        def from_param(cls, value):
+            return None if value is None else super().from_param(value)
+
+    maybe = OptionalArray
+    loaded.cgm_advance.argtypes = [array, array, array, number, count]
+    loaded.cgm_advance.restype = None
+    loaded.cgm_simulate.argtypes = [count, array, number, array, array, array, array]
+    loaded.cgm_outputs.argtypes = [count, array, array, array, array, array, array]
+    loaded.cgm_outputs.restype = None
+    loaded.cgm_normal.argtypes = [
+        count, array, number, array, array, count, array, array, array, count, whole, array,
+        array, array, whole, array, array, array, array, array, maybe, maybe,
+    ]  # fmt: skip
+    return loaded

@@ -1,0 +1,37 @@
+"""The effect library, by standard name. A new effect is one class in one file of this folder.
+
+Every module here that defines a subclass of `Effect` with a name is found by itself.
+"""
+
+import importlib
+import pkgutil
+
+from cg_dynamics.effects.effect import Body, Effect
+from cg_dynamics.errors import ModelError
+from cg_dynamics.mechanisms.mechanism import Mechanism
+
+__all__ = ['LIBRARY', 'Body', 'Effect', 'make_effect']
+
+
+def _library() -> dict[str, type[Effect]]:
+    found: dict[str, type[Effect]] = {}
+    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        contents = vars(importlib.import_module(f'{__name__}.{module}'))
+        for item in contents.values():
+            if isinstance(item, type) and issubclass(item, Effect) and 'name' in vars(item):
+                found[item.name] = item
+    return found
+
+
+LIBRARY = _library()
+
+
+def make_effect(name: str, mechanism: Mechanism, at: str | None = None) -> Effect:
+    """The effect called name, acting at a joint, body or sensor of a mechanism.
+
+    Raises:
+        ModelError: if there is no such effect, or not at such a place.
+    """
+    if name not in LIBRARY:
+        raise ModelError(f'unknown effect {name!r}; the library has: {", ".join(LIBRARY)}')
+    return LIBRARY[name](mechanism, at)

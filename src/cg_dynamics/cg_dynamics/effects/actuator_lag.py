@@ -1,0 +1,28 @@
+"""First-order lag of the motor's torque."""
+
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+
+class ActuatorLag(Effect):
+    """T dtau_motor/dt = tau - tau_motor."""
+
+    name = 'actuator_lag'
+    place = 'command'
+    summary = 'The current loop is slow: T dtau_motor/dt = tau - tau_motor.'
+    parameters = (
+        Parameter(
+            'time_constant', 's', 'T', 0.001, 0.3,
+            neutral=0.0, starts=(0.01, 0.05), scale=0.001, logarithmic=True,
+        ),
+    )  # fmt: skip
+    states = ('torque',)
+    largest_step = 0.001
+
+    def deliver(self, torque, z, p):
+        """The filtered torque is the state."""
+        return z[0], [(torque - z[0]) / p['time_constant']]
+
+    def initial_states(self, angle, rate, torque, p):
+        """Settled at the torque that is held at the start."""
+        return [torque]

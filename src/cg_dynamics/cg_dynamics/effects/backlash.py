@@ -1,0 +1,66 @@
+"""Play between motor and joint."""
+
+import casadi as ca
+
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+
+class Backlash(Effect):
+    """A rotor of reflected inertia drives the joint through a gap.
+
+    With e = a - angle the wind-up, g half of the gap and s(x) = (x + sqrt(x^2 + w^2))/2 a ramp
+    smoothed over w = g/10, the teeth touch by
+
+    x = s(e - g) - s(-e - g),  tau_joint = k x + d c (w - rate),  c = dx/de         (GAP)
+    """
+
+    name = 'backlash'
+    place = 'transmission'
+    summary = (
+        'Play in the gear: the rotor turns freely within the gap and pushes the joint only '
+        'where teeth touch.'
+    )
+    parameters = (
+        Parameter(
+            'gap', 'rad', 'total play at the joint', 2e-4, 0.3,
+            neutral=0.0, starts=(0.005, 0.03), scale=0.001, logarithmic=True,
+        ),
+        Parameter(
+            'rotor_inertia', 'kg m^2', 'seen from the joint', 1e-5, 10.0,
+            starts=(0.1,), scale=0.01, logarithmic=True,
+        ),
+        Parameter(
+            'stiffness', 'N m/rad', 'of the touching teeth', 1.0, 1e5,
+            starts=(4000.0,), scale=100.0, free=False, logarithmic=True,
+        ),
+        Parameter(
+            'damping', 'N m s/rad', 'of the touching teeth', 0.0, 100.0,
+            starts=(5.0,), scale=0.5, free=False,
+        ),
+    )  # fmt: skip
+    states = ('rotor_angle', 'rotor_rate')
+    largest_step = 0.0005
+
+    def transmit(self, torque, angle, rate, z, p):
+        """(GAP)."""
+        a, w = z
+        half = p['gap'] / 2
+        wind_up = a - angle
+        width = half / 10
+
+        def ramp(x):
+            return (x + ca.sqrt(x**2 + width**2)) / 2
+
+        def step(x):
+            return (1 + x / ca.sqrt(x**2 + width**2)) / 2
+
+        pressed = ramp(wind_up - half) - ramp(-wind_up - half)
+        touching = step(wind_up - half) + step(-wind_up - half)
+        joint = p['stiffness'] * pressed + p['damping'] * touching * (w - rate)
+        return joint, [w, (torque - joint) / p['rotor_inertia']]
+
+    def initial_states(self, angle, rate, torque, p):
+        """On the flank that the held torque presses on, moving with the joint."""
+        side = ca.tanh(torque / 0.1)
+        return [angle + side * p['gap'] / 2 + torque / p['stiffness'], rate]

@@ -1,0 +1,173 @@
+"""What an effect is: one physical phenomenon, and the places where it can enter a model.
+
+An effect overrides the hooks of the places where it acts and leaves the others alone; each hook
+receives what flows through that place and returns what leaves it. The order along the torque
+path is the order of the hooks below, so any effects compose:
+
+    input --input_delay--> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
+    Q and M also take energies, force and up;   outputs: read, then output_delay
+
+In every hook `p` maps the effect's own parameter names to symbols and `z` holds its own extra
+states, a list; a hook that owns states returns their rates in the same order.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import casadi as ca
+
+from cg_dynamics.errors import ModelError
+from cg_dynamics.mechanisms.mechanism import Mechanism
+from cg_dynamics.parameter import Parameter
+from cg_dynamics.rig import Setup
+
+Symbols = Mapping[str, ca.SX]
+
+
+@dataclass(frozen=True)
+class Body:
+    """The mechanism as an effect sees it: symbols and geometry in one set-up.
+
+    Attributes:
+        mechanism: The mechanism.
+        setup: The set-up.
+        q: Full coordinates, shape (n, 1).
+        v: Their rates.
+        p: The mechanism's parameters by name.
+        up: Unit vector (x, z) against gravity.
+    """
+
+    mechanism: Mechanism
+    setup: Setup
+    q: ca.SX
+    v: ca.SX
+    p: Symbols
+    up: ca.SX
+
+    def point(self, name: str, distance) -> tuple[ca.SX, ca.SX]:
+        """World position in m and velocity in m/s of a point of a body, shapes (2, 1)."""
+        position = self.mechanism.point(name, distance, self.q, self.p, self.setup)
+        return position, ca.jtimes(position, self.q, self.v)
+
+
+class Effect:
+    """Base of all effects. Immutable; parameters live in the model, not in the effect.
+
+    Attributes:
+        name: Standard name, the same in files, reports and docs.
+        place: Where it acts: command, transmission, joint, body, environment, impact, sensor,
+            timing.
+        summary: One sentence for people, with the equation in plain text.
+        parameters: Declared parameters.
+        states: Names of extra states.
+        largest_step: Longest integration step in s at which the effect is still simulated well.
+        at: Joint, body or sensor where this instance acts; None where there is only one.
+    """
+
+    name: ClassVar[str]
+    place: ClassVar[str]
+    summary: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    states: ClassVar[tuple[str, ...]] = ()
+    largest_step: ClassVar[float] = float('inf')
+
+    def __init__(self, mechanism: Mechanism, at: str | None = None):
+        sites = self.sites(mechanism)
+        if not sites:
+            raise ModelError(f'effect {self.name!r} does not apply to a {mechanism.name}')
+        if at is not None and at not in sites:
+            raise ModelError(
+                f'effect {self.name!r} acts at {", ".join(sites)} of a {mechanism.name}, '
+                f'not at {at!r}'
+            )
+        self.site = sites[0] if at is None else at
+        self.at = None if self.site == sites[0] else self.site
+
+    @property
+    def label(self) -> str:
+        """Name within a model: the standard name, and the place where it is not the usual one."""
+        return self.name if self.at is None else f'{self.name}@{self.at}'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """Where this effect can act in a mechanism, the usual place first; empty if nowhere."""
+        if cls.place in ('command', 'transmission', 'joint'):
+            return tuple(mechanism.joints)
+        return ('all',)
+
+    def acts(self, values: Mapping[str, float]) -> bool:
+        """False if the first parameter has its neutral value, so that nothing happens at all."""
+        first = self.parameters[0]
+        return values[first.name] != first.neutral
+
+    # --- hooks, in the order in which they act ------------------------------------------------
+
+    def input_delay(self, p: Symbols) -> ca.SX | None:
+        """Time in s by which the inputs act late."""
+        return None
+
+    def deliver(self, torque: ca.SX, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
+        """Torque of the motor in N m, from the torque that the drive reports."""
+        return torque, []
+
+    def transmit(
+        self, torque: ca.SX, angle: ca.SX, rate: ca.SX, z: list[ca.SX], p: Symbols
+    ) -> tuple[ca.SX, list[ca.SX]]:
+        """Torque that reaches the joint, given the joint's angle in rad and rate in rad/s."""
+        return torque, []
+
+    def joint_torque(
+        self, angle: ca.SX, rate: ca.SX, load: ca.SX, z: list[ca.SX], p: Symbols
+    ) -> tuple[ca.SX, list[ca.SX]]:
+        """Torque in N m that adds to the joint's; `load` is the torque transmitted so far."""
+        return ca.SX(0), []
+
+    def up(self, up: ca.SX, p: Symbols) -> ca.SX:
+        """Direction against gravity, (x, z)."""
+        return up
+
+    def energies(self, body: Body, p: Symbols) -> tuple[ca.SX, ca.SX]:
+        """Kinetic and potential energy in J that the effect adds."""
+        return ca.SX(0), ca.SX(0)
+
+    def force(self, body: Body, p: Symbols) -> ca.SX:
+        """Generalised force in N m that the effect adds, shape (n, 1)."""
+        return ca.SX.zeros(body.q.shape)
+
+    def read(
+        self, outputs: dict[str, ca.SX], z: list[ca.SX], p: Symbols
+    ) -> tuple[dict[str, ca.SX], list[ca.SX]]:
+        """What the sensors report, from what they should."""
+        return outputs, []
+
+    def output_delay(self, channel: str, p: Symbols) -> ca.SX | None:
+        """Time in s by which a channel reports late."""
+        return None
+
+    def initial_states(self, angle: ca.SX, rate: ca.SX, torque: ca.SX, p: Symbols) -> list[ca.SX]:
+        """Extra states at the start of a record, from joint angle, rate and held torque."""
+        return [ca.SX(0) for _ in self.states]
+
+
+class SensorEffect(Effect):
+    """An effect of one sensor channel."""
+
+    place = 'sensor'
+    kind: ClassVar[str]
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """The channels of the right kind."""
+        return tuple(c for c, kind in mechanism.sensor_kinds.items() if kind == cls.kind)
+
+
+class BodyEffect(Effect):
+    """An effect tied to one body."""
+
+    place = 'body'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """The bodies of the mechanism."""
+        return mechanism.bodies

@@ -1,0 +1,30 @@
+"""A point mass that somebody tied on."""
+
+import casadi as ca
+
+from cg_dynamics.effects.effect import BodyEffect
+from cg_dynamics.parameter import Parameter
+
+
+class Payload(BodyEffect):
+    """T = m |dr/dt|^2 / 2, V = m g (up . r) for a point r of a body."""
+
+    name = 'payload'
+    summary = 'A point mass rides on a body: T = m |dr/dt|^2 / 2, V = m g (up . r).'
+    parameters = (
+        Parameter(
+            'mass', 'kg', 'of the payload', 0.0, 20.0, neutral=0.0, starts=(0.05, 0.5), scale=0.05
+        ),
+        Parameter(
+            'distance', 'm', 'from the lower or proximal end of the body', 0.0, 3.0,
+            starts=(0.6, 0.2, 1.0), scale=0.05,
+        ),
+    )  # fmt: skip
+
+    def energies(self, body, p):
+        """Energies of the point mass."""
+        position, velocity = body.point(self.site, p['distance'])
+        return (
+            p['mass'] * ca.sumsqr(velocity) / 2,
+            p['mass'] * body.p['gravity'] * ca.dot(body.up, position),
+        )

@@ -1,0 +1,84 @@
+"""What a mechanism is: coordinates, energies, joints and what its sensors see."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+
+from cg_dynamics.parameter import Parameter
+from cg_dynamics.rig import Setup
+
+Symbols = Mapping[str, ca.SX]
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Coordinates of a mechanism in one set-up, reduced to those that are free to move.
+
+    Attributes:
+        names: Names of the free coordinates s.
+        basis: q = basis s, shape (n, m): which full coordinate follows which free one.
+    """
+
+    names: tuple[str, ...]
+    basis: ca.DM
+
+
+class Mechanism(ABC):
+    """A planar rigid-body mechanism in the textbook sense, M(q) dv/dt + b(q, v) = B u.
+
+    Attributes:
+        name: Name in model files.
+        coordinates: Names of the full coordinates q.
+        joints: Actuated joint -> row B_j with joint angle = B_j q; a torque on the joint is the
+            generalised force B_j' tau.
+        inputs: Input channels, one per actuated joint in the order of `joints`.
+        outputs: Output channels, in order.
+        output_units: Unit of each output channel.
+        sensor_kinds: Output channel -> 'encoder', 'inclinometer' or 'gyro'.
+        bodies: Bodies that a payload or a spring can be tied to.
+        parameters: Declared parameters.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    joints: Mapping[str, tuple[float, ...]]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    output_units: tuple[str, ...]
+    sensor_kinds: Mapping[str, str]
+    bodies: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+
+    @abstractmethod
+    def energies(
+        self, q: ca.SX, v: ca.SX, p: Symbols, setup: Setup, up: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Kinetic and potential energy in J.
+
+        Args:
+            q: Full coordinates, shape (n, 1).
+            v: Their rates.
+            p: Parameters by name.
+            setup: The set-up.
+            up: Unit vector (x, z) against gravity; (0, 1) on level ground.
+        """
+
+    @abstractmethod
+    def point(self, body: str, distance, q: ca.SX, p: Symbols, setup: Setup) -> ca.SX:
+        """World position (x, z) in m of the point of `body` at `distance` m from its lower
+        or proximal end (docs/conventions.md).
+        """  # noqa: D205
+
+    @abstractmethod
+    def sensors(self, q: ca.SX, v: ca.SX) -> dict[str, ca.SX]:
+        """What ideal sensors would report: output channel -> expression."""
+
+    def kinematics(self, setup: Setup) -> Kinematics:
+        """Free coordinates in this set-up; all of them unless a mechanism knows fixtures."""
+        return Kinematics(self.coordinates, ca.DM.eye(len(self.coordinates)))
+
+    def consistency(self, p: Symbols) -> list[ca.SX]:
+        """Expressions that are positive if and only if real bodies have these parameters."""
+        return []

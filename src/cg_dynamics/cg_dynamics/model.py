@@ -1,0 +1,245 @@
+"""A model: mechanism, effects and their numbers. The one thing that all other packages load."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cg_description.model_file import (
+    EffectEntry,
+    ModelFile,
+    ModelFileError,
+    Quantity,
+    dump,
+    load,
+    parse,
+    sha256,
+    write_atomically,
+)
+
+from cg_dynamics.effects import Effect, make_effect
+from cg_dynamics.errors import ModelError
+from cg_dynamics.mechanisms import Mechanism, mechanism
+from cg_dynamics.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class Model:
+    """A robot as numbers and physics. Immutable: every change returns a new model.
+
+    Attributes:
+        name: Name of the robot.
+        mechanism: Its rigid bodies.
+        effects: Effects, in the order in which they act.
+        quantities: Full parameter name -> number with unit and source. A parameter of the
+            mechanism goes by its own name ('c1'), one of an effect by 'label.name'
+            ('coulomb_friction.torque').
+        sensors: Channel -> quantities 'noise', 'resolution' (both optional).
+        actuators: Input channel -> quantity 'limit' (optional).
+        description: Free text.
+        provenance: Where the model comes from.
+    """
+
+    name: str
+    mechanism: Mechanism
+    effects: tuple[Effect, ...]
+    quantities: Mapping[str, Quantity]
+    sensors: Mapping[str, Mapping[str, Quantity]]
+    actuators: Mapping[str, Mapping[str, Quantity]]
+    description: str
+    provenance: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: str | Path) -> 'Model':
+        """Read a model file.
+
+        Raises:
+            ModelFileError, ModelError: naming the file, the entry and what is allowed there.
+        """
+        return cls.from_file(load(path), str(path))
+
+    @classmethod
+    def from_text(cls, text: str, where: str = 'model') -> 'Model':
+        """Read the text of a model file, e.g. as it travels with a bag."""
+        return cls.from_file(parse(text, where), where)
+
+    @classmethod
+    def from_file(cls, file: ModelFile, where: str = 'model') -> 'Model':
+        """Give meaning to a model file: known names, right units, values in range."""
+        try:
+            body = mechanism(file.mechanism)
+            quantities = _match(body.parameters, file.parameters, 'parameters')
+            effects = []
+            for entry in file.effects:
+                effect = make_effect(entry.name, body, entry.at)
+                if any(effect.label == other.label for other in effects):
+                    raise ModelError(f'effect {effect.label!r} is listed twice')
+                effects.append(effect)
+                found = _match(effect.parameters, entry.parameters, effect.label)
+                quantities |= {f'{effect.label}.{name}': q for name, q in found.items()}
+            _known('sensors', file.sensors, body.outputs)
+            _known('actuators', file.actuators, body.inputs)
+            for channel, unit in zip(body.outputs, body.output_units, strict=True):
+                for name, q in file.sensors.get(channel, {}).items():
+                    _known(f'sensors.{channel}', [name], ('noise', 'resolution'))
+                    _same_unit(f'sensors.{channel}.{name}', q.unit, unit)
+        except ModelError as error:
+            raise ModelError(f'{where}: {error}') from None
+        model = cls(
+            name=file.name,
+            mechanism=body,
+            effects=tuple(effects),
+            quantities=quantities,
+            sensors=file.sensors,
+            actuators=file.actuators,
+            description=file.description,
+            provenance=file.provenance,
+        )
+        model.require_consistency(where)
+        return model
+
+    def to_file(self) -> ModelFile:
+        """The content that `from_file` reads back."""
+        return ModelFile(
+            name=self.name,
+            mechanism=self.mechanism.name,
+            parameters={p.name: self.quantities[p.name] for p in self.mechanism.parameters},
+            effects=tuple(
+                EffectEntry(
+                    effect.name,
+                    effect.at,
+                    {p.name: self.quantities[f'{effect.label}.{p.name}'] for p in effect.parameters},
+                )
+                for effect in self.effects
+            ),
+            sensors={c: dict(q) for c, q in self.sensors.items()},
+            actuators={c: dict(q) for c, q in self.actuators.items()},
+            description=self.description,
+            provenance=dict(self.provenance),
+        )
+
+    def text(self) -> str:
+        """The text of the model file."""
+        return dump(self.to_file())
+
+    def save(self, path: str | Path) -> None:
+        """Write the model file, whole or not at all."""
+        write_atomically(path, self.text())
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the text: the name by which bags and trajectories know this model."""
+        return sha256(self.text())
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Full parameter name -> value."""
+        return {name: q.value for name, q in self.quantities.items()}
+
+    @property
+    def declarations(self) -> dict[str, Parameter]:
+        """Full parameter name -> declaration, in the order of the parameter vector."""
+        found = {p.name: p for p in self.mechanism.parameters}
+        for effect in self.effects:
+            found |= {f'{effect.label}.{p.name}': p for p in effect.parameters}
+        return found
+
+    @property
+    def torque_limit(self) -> float:
+        """Smallest stated limit of the actuators in N m; infinite where none is stated."""
+        limits = [q['limit'].value for q in self.actuators.values() if 'limit' in q]
+        return min(limits, default=float('inf'))
+
+    def effect(self, label: str) -> Effect:
+        """The effect with that label."""
+        for effect in self.effects:
+            if effect.label == label:
+                return effect
+        raise ModelError(f'model {self.name!r} has no effect {label!r}; it has: '
+                         f'{", ".join(e.label for e in self.effects) or "none"}')
+
+    def with_effect(self, name: str, at: str | None = None, **values: float) -> 'Model':
+        """This model and one more effect; parameters not given take their defaults."""
+        effect = make_effect(name, self.mechanism, at)
+        if any(effect.label == other.label for other in self.effects):
+            raise ModelError(f'model {self.name!r} already has the effect {effect.label!r}')
+        _known(effect.label, values, [p.name for p in effect.parameters])
+        quantities = dict(self.quantities)
+        for p in effect.parameters:
+            value = p.check(float(values.get(p.name, p.default)), effect.label)
+            quantities[f'{effect.label}.{p.name}'] = Quantity(value, p.unit, fixed=not p.free)
+        return replace(self, effects=(*self.effects, effect), quantities=quantities)
+
+    def without_effect(self, label: str) -> 'Model':
+        """This model less one effect."""
+        gone = self.effect(label)
+        return replace(
+            self,
+            effects=tuple(e for e in self.effects if e is not gone),
+            quantities={
+                name: q
+                for name, q in self.quantities.items()
+                if not name.startswith(f'{label}.')
+            },
+        )
+
+    def with_values(self, values: Mapping[str, float]) -> 'Model':
+        """This model with other numbers; units, tolerances and sources stay.
+
+        Raises:
+            ModelError: for an unknown name or a value out of range.
+        """
+        declared = self.declarations
+        _known('parameters', values, declared)
+        quantities = dict(self.quantities)
+        for name, value in values.items():
+            declared[name].check(float(value), name.rpartition('.')[0] or self.name)
+            quantities[name] = replace(quantities[name], value=float(value))
+        return replace(self, quantities=quantities)
+
+    def require_consistency(self, where: str = 'model') -> None:
+        """Refuse numbers that no real bodies can have (docs/conventions.md, "Lumps").
+
+        Raises:
+            ModelError: if a consistency condition is broken.
+        """
+        for index, value in enumerate(self.mechanism.consistency(self.values)):
+            if not value > 0:
+                raise ModelError(
+                    f'{where}: no real bodies have these parameters: condition {index + 1} of '
+                    f'the {self.mechanism.name} (docs/conventions.md, "Lumps") is {value:.3g}, '
+                    'it must be positive'
+                )
+
+
+def _match(
+    declared: tuple[Parameter, ...], given: Mapping[str, Quantity], owner: str
+) -> dict[str, Quantity]:
+    _known(owner, given, [p.name for p in declared])
+    found = {}
+    for p in declared:
+        if p.name not in given:
+            # A mechanism has no typical numbers; an effect has.
+            if owner == 'parameters':
+                raise ModelError(f'{owner}.{p.name} ({p.unit}, {p.description}) is missing')
+            found[p.name] = Quantity(p.default, p.unit, fixed=not p.free)
+            continue
+        q = given[p.name]
+        _same_unit(f'{owner}.{p.name}', q.unit, p.unit)
+        p.check(q.value, owner)
+        found[p.name] = q
+    return found
+
+
+def _same_unit(where: str, unit: str, expected: str) -> None:
+    if unit != expected:
+        raise ModelError(f'{where}: unit is {unit!r}, expected {expected!r}')
+
+
+def _known(where: str, names, allowed) -> None:
+    for name in names:
+        if name not in allowed:
+            raise ModelError(f'{where}: unknown entry {name!r}; allowed: {", ".join(allowed)}')
+
+
+__all__ = ['Model', 'ModelError', 'ModelFileError']

@@ -1,0 +1,60 @@
+"""What a physical parameter is: the one place of its name, unit, range and neutral value."""
+
+import math
+from dataclasses import dataclass
+
+from cg_dynamics.errors import ModelError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Declaration of a parameter of a mechanism or an effect.
+
+    Attributes:
+        name: Name within its owner, e.g. 'stiffness'.
+        unit: SI unit, '1' for a ratio.
+        description: One phrase for people.
+        lower: Smallest allowed value, in `unit`.
+        upper: Largest allowed value, in `unit`.
+        neutral: Value at which the effect vanishes exactly; None where no single value does that
+            (a parameter of shape).
+        starts: Values from which an identification sets out when nothing is known yet.
+        free: False for a parameter of shape that identification leaves alone unless told.
+        scale: Typical size of a change worth noticing, in `unit`; steps and priors use it.
+        logarithmic: True where the ratio of two values means more than their difference.
+    """
+
+    name: str
+    unit: str
+    description: str
+    lower: float
+    upper: float
+    neutral: float | None = None
+    starts: tuple[float, ...] = ()
+    free: bool = True
+    scale: float = 1.0
+    logarithmic: bool = False
+
+    @property
+    def default(self) -> float:
+        """Value used when a file names the effect but not this parameter."""
+        if self.starts:
+            return self.starts[0]
+        if self.neutral is not None:
+            return self.neutral
+        raise ModelError(f'{self.name!r} has no default; state it')
+
+    def check(self, value: float, owner: str) -> float:
+        """Return value if it is allowed.
+
+        Raises:
+            ModelError: naming the parameter, the value and the range.
+        """
+        if value == self.neutral:
+            return value
+        if not math.isfinite(value) or not self.lower <= value <= self.upper:
+            raise ModelError(
+                f'{owner}.{self.name} = {value:g} {self.unit} is outside its range '
+                f'[{self.lower:g}, {self.upper:g}] {self.unit}'
+            )
+        return value

@@ -1,0 +1,197 @@
+"""What every node of this project shares: declared settings, stamps, the spinning loop.
+
+The only module outside `*_node.py` that imports rclpy. A node is built on three things:
+
+- `DeclaredSettings` declares the fields of a frozen Settings class as ROS parameters with
+  description, unit and range, and keeps the present instance.
+- `run` makes the node, spins it in one thread until it is told to stop, and always calls its
+  `close`, while the context still stands, so that a last zero torque can go out.
+- A node that has something to do between messages has `poll() -> float`: it does what is due
+  and returns in how many s it wants to be asked again.
+"""
+
+import dataclasses
+import logging
+import math
+import signal
+import sys
+import time
+import typing
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from builtin_interfaces.msg import Time
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import ParameterException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from cg_dynamics.settings import Settings, describe
+
+SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED_QOS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+IDLE_POLL = 0.05  # s
+LARGEST_DOUBLE = sys.float_info.max
+LARGEST_INTEGER = 2**63 - 1
+
+PARAMETER_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+    tuple[float, ...]: Parameter.Type.DOUBLE_ARRAY,
+    tuple[str, ...]: Parameter.Type.STRING_ARRAY,
+}
+
+
+class DeclaredSettings:
+    """The settings of a node, declared as ROS parameters and kept up to date.
+
+    Attributes:
+        values: The present, valid instance of the Settings class.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type[Settings],
+        at_work: Callable[[], bool] = lambda: True,
+    ):
+        """Declare every field of `kind` on the node.
+
+        Args:
+            node: Gets the parameters.
+            kind: The Settings class.
+            at_work: Tells whether settings that are not live must be refused now.
+
+        Raises:
+            ValueError: A value given at the start is not allowed.
+        """
+        hints = typing.get_type_hints(kind)
+        given = {}
+        for field in dataclasses.fields(kind):
+            type_ = PARAMETER_TYPES[hints[field.name]]
+            default = list(field.default) if isinstance(field.default, tuple) else field.default
+            declared = node.declare_parameter(
+                field.name, Parameter(field.name, type_, default).value, _descriptor(field, type_)
+            )
+            given[field.name] = declared.value
+        self.values = kind(**given)
+        self._at_work = at_work
+        node.add_on_set_parameters_callback(self._judge)
+        node.add_post_set_parameters_callback(self._adopt)
+
+    def _mine(self, parameters: list[Parameter]) -> dict[str, Any]:
+        names = {field.name for field in dataclasses.fields(self.values)}
+        return {p.name: p.value for p in parameters if p.name in names}
+
+    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
+        changes = self._mine(parameters)
+        for name in changes:
+            if self._at_work() and not self.values.field(name).metadata['live']:
+                return SetParametersResult(
+                    successful=False, reason=f'{name} cannot change while the node is at work'
+                )
+        try:
+            dataclasses.replace(self.values, **changes)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _adopt(self, parameters: list[Parameter]) -> None:
+        self.values = dataclasses.replace(self.values, **self._mine(parameters))
+
+
+def _descriptor(field: dataclasses.Field, type_: Parameter.Type) -> ParameterDescriptor:
+    low, high = field.metadata['minimum'], field.metadata['maximum']
+    descriptor = ParameterDescriptor(
+        name=field.name, type=type_.value, description=describe(field)
+    )
+    if low is None and high is None:
+        return descriptor
+    if type_ == Parameter.Type.DOUBLE:
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-LARGEST_DOUBLE if low is None else float(low),
+                to_value=LARGEST_DOUBLE if high is None else float(high),
+            )
+        ]
+    if type_ == Parameter.Type.INTEGER:
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=-LARGEST_INTEGER if low is None else int(low),
+                to_value=LARGEST_INTEGER if high is None else int(high),
+            )
+        ]
+    return descriptor
+
+
+def to_stamp(nanoseconds: int) -> Time:
+    """ROS stamp of a time in ns."""
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def to_nanoseconds(stamp: Time) -> int:
+    """Time in ns of a ROS stamp."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
+    """Make a node and spin it until SIGINT, SIGTERM or its own `finished`.
+
+    Returns:
+        Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for settings
+        that are refused.
+    """
+    # rclpy's own handlers would shut the context down before the node can send its last torque.
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    stop = StopRequest()
+    node = None
+    try:
+        try:
+            node = make_node()
+        except (ValueError, OSError, ParameterException) as error:
+            print(f'error: {error}', file=sys.stderr)
+            return 2
+        executor = EventsExecutor()
+        executor.add_node(node)
+        poll = getattr(node, 'poll', lambda: IDLE_POLL)
+        while not stop.requested and not getattr(node, 'finished', False):
+            wait = poll()
+            if wait > 0.0:
+                executor.spin_once(timeout_sec=min(wait, IDLE_POLL))
+            else:
+                executor.spin_once(timeout_sec=0.0)
+        return getattr(node, 'exit_status', 0)
+    finally:
+        if node is not None:
+            if hasattr(node, 'close'):
+                node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class StopRequest:
+    """Set by SIGINT or SIGTERM, even where the parent shell made the process ignore them."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: Any) -> None:
+        self.requested = True
