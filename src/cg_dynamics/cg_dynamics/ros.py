@@ -11,11 +11,8 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
 """
 
 import dataclasses
-import logging
-import math
 import signal
 import sys
-import time
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -160,29 +157,31 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     # rclpy's own handlers would shut the context down before the node can send its last torque.
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stop = StopRequest()
-    node = None
     try:
         try:
             node = make_node()
         except (ValueError, OSError, ParameterException) as error:
             print(f'error: {error}', file=sys.stderr)
             return 2
-        executor = EventsExecutor()
-        executor.add_node(node)
-        poll = getattr(node, 'poll', lambda: IDLE_POLL)
-        while not stop.requested and not getattr(node, 'finished', False):
-            wait = poll()
-            if wait > 0.0:
-                executor.spin_once(timeout_sec=min(wait, IDLE_POLL))
-            else:
-                executor.spin_once(timeout_sec=0.0)
+        try:
+            spin(node, lambda: stop.requested)
+        finally:
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
         return getattr(node, 'exit_status', 0)
     finally:
-        if node is not None:
-            if hasattr(node, 'close'):
-                node.close()
-            node.destroy_node()
         rclpy.try_shutdown()
+
+
+def spin(node: Node, stopped: Callable[[], bool]) -> None:
+    """Serve a node's messages and its `poll` in this thread until `stopped` or `finished`."""
+    executor = EventsExecutor()
+    executor.add_node(node)
+    poll = getattr(node, 'poll', lambda: IDLE_POLL)
+    while not stopped() and not getattr(node, 'finished', False):
+        # A wait without a time-out hangs in this executor.
+        executor.spin_once(timeout_sec=min(max(poll(), 0.0), IDLE_POLL))
+    executor.remove_node(node)
 
 
 class StopRequest:
