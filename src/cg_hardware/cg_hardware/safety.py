@@ -1,0 +1,131 @@
+"""What a torque command must be before it may reach a motor. Pure; no ROS.
+
+The rule of the house: torque is zero when anything is in doubt. `TorqueGate` holds the last
+command that was fit to be held and answers, at any instant, which torque may act:
+
+- a command that is not finite, or of the wrong length, is refused, and the torque is zero until
+  the next good one;
+- a command beyond the limit is brought back to the limit (a motor saturates as well);
+- a command older than `stale_after` counts as lost: torque zero;
+- optionally, the torque climbs away from zero no faster than `rate_limit`; towards zero it is
+  always free.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cg_dynamics.settings import Settings, setting
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class GateSettings(Settings):
+    """What the gate lets through."""
+
+    torque_limit: float = setting(
+        40.0, 'largest torque that is passed on', unit='N m', minimum=0.0, live=True
+    )
+    stale_after: float = setting(
+        0.02,
+        'age beyond which a command counts as lost and the torque is zero',
+        unit='s',
+        minimum=0.001,
+        maximum=10.0,
+        live=True,
+    )
+    rate_limit: float = setting(
+        0.0, 'fastest growth of the torque, 0 for no limit', unit='N m/s', minimum=0.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Which torque may act, and why it is not what was asked for.
+
+    Attributes:
+        torque: In N m, one per joint.
+        doubt: Empty if the request passes as it is.
+    """
+
+    torque: tuple[float, ...]
+    doubt: str = ''
+
+
+def judge(request: Sequence[float], joints: Sequence[str], limit: float) -> Judgement:
+    """Judge one request by its values alone.
+
+    Args:
+        request: Torque asked for, in N m.
+        joints: Names of the joints it must serve.
+        limit: Largest magnitude allowed, in N m.
+    """
+    zero = (0.0,) * len(joints)
+    if len(request) != len(joints):
+        return Judgement(zero, f'{len(request)} torques for the joints {", ".join(joints)}')
+    for joint, torque in zip(joints, request, strict=True):
+        if not math.isfinite(torque):
+            return Judgement(zero, f'torque of {joint} is {torque}; a finite number is needed')
+    limited = tuple(min(max(float(torque), -limit), limit) for torque in request)
+    for joint, torque, held in zip(joints, request, limited, strict=True):
+        if torque != held:
+            return Judgement(
+                limited, f'torque of {joint} is {torque:.6g} N m; limited to {held:.6g} N m'
+            )
+    return Judgement(limited)
+
+
+class TorqueGate:
+    """Remembers the last command and says at any instant which torque may act."""
+
+    def __init__(self, settings: GateSettings, joints: Sequence[str]):
+        self.settings = settings
+        self.joints = tuple(joints)
+        self._zero = (0.0,) * len(self.joints)
+        self._held = Judgement(self._zero, 'no command yet')
+        self._held_ns: int | None = None
+        self._output = self._zero
+        self._output_ns: int | None = None
+
+    def offer(self, request: Sequence[float], stamp_ns: int) -> Judgement:
+        """Take in a command made at `stamp_ns`; older than the one held, it is ignored."""
+        if self._held_ns is not None and stamp_ns < self._held_ns:
+            return Judgement(self._held.torque, 'older than the command before it; ignored')
+        self._held = judge(request, self.joints, self.settings.torque_limit)
+        self._held_ns = stamp_ns
+        return self._held
+
+    def drop(self, reason: str) -> None:
+        """Forget the command: torque zero until the next good one."""
+        self._held = Judgement(self._zero, reason)
+        self._held_ns = None
+
+    def torque(self, now_ns: int) -> Judgement:
+        """The torque that may act at `now_ns`, a time of the same clock as the stamps."""
+        judgement = self._held
+        if self._held_ns is not None:
+            age = (now_ns - self._held_ns) / NANOSECONDS
+            if abs(age) > self.settings.stale_after:
+                kind = 'old' if age > 0.0 else 'ahead of the clock'
+                judgement = Judgement(self._zero, f'command is {abs(age):.3g} s {kind}')
+        torque = self._slowed(judgement.torque, now_ns)
+        self._output, self._output_ns = torque, now_ns
+        return Judgement(torque, judgement.doubt)
+
+    def _slowed(self, wanted: tuple[float, ...], now_ns: int) -> tuple[float, ...]:
+        if self.settings.rate_limit == 0.0:
+            return wanted
+        elapsed = 0.0 if self._output_ns is None else (now_ns - self._output_ns) / NANOSECONDS
+        step = self.settings.rate_limit * max(elapsed, 0.0)
+        return tuple(
+            _approach(before, after, step)
+            for before, after in zip(self._output, wanted, strict=True)
+        )
+
+
+def _approach(before: float, after: float, step: float) -> float:
+    """The value nearest to `after` that is at most `step` further from zero than `before`."""
+    start = before if before * after > 0.0 else 0.0
+    reach = abs(start) + step
+    return min(max(after, -reach), reach)

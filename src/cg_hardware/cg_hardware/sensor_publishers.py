@@ -1,0 +1,134 @@
+"""ROS side of the sensors: measurements of a plant become messages, torque messages numbers."""
+
+import math
+from typing import Any
+
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Int64
+
+from cg_dynamics.ros import SENSOR_QOS, to_stamp
+from cg_hardware import topics
+
+
+class SensorPublishers:
+    """Publishes one measurement on all topics of its mechanism, reusing its messages."""
+
+    def __init__(self, node: Node, mechanism: str, variances: dict[str, float]):
+        """Create the publishers.
+
+        Args:
+            node: Publishes.
+            mechanism: Name of the mechanism, a row of docs/interfaces.md.
+            variances: Channel -> variance of its noise, for the covariances of the IMU.
+        """
+        self.joints = topics.joints_of(mechanism)
+        self._publish_parts = {
+            'compass_gait': self._publish_compass_gait,
+            'pendulum': self._publish_pendulum,
+            'double_pendulum': self._publish_double_pendulum,
+        }[mechanism]
+        self.applied = JointState(name=list(self.joints))
+        self.applied.header.frame_id = topics.TORQUE_FRAME[mechanism]
+        self.publishers: dict[str, Any] = {}
+        self._publisher(node, JointState, topics.APPLIED_TORQUE)
+        if mechanism == 'compass_gait':
+            self._prepare_compass_gait(node, variances)
+        else:
+            self._publisher(node, JointState, topics.JOINT_STATES)
+            self.joint_states = JointState(name=list(self.joints))
+            self.joint_states.header.frame_id = topics.TORQUE_FRAME[mechanism]
+
+    def _publisher(self, node: Node, kind: type, topic: str) -> None:
+        self.publishers[topic] = node.create_publisher(kind, topic, SENSOR_QOS)
+
+    def _prepare_compass_gait(self, node: Node, variances: dict[str, float]) -> None:
+        for kind, topic in (
+            (JointState, topics.HIP_ENCODER),
+            (Int64, topics.HIP_COUNTS),
+            (WrenchStamped, topics.FOOT_CONTACT.format(leg='inner')),
+            (WrenchStamped, topics.FOOT_CONTACT.format(leg='outer')),
+            (Imu, topics.IMU),
+        ):
+            self._publisher(node, kind, topic)
+        self.imu = Imu()
+        self.imu.header.frame_id = 'imu_link'
+        self.imu.orientation_covariance[4] = variances.get('imu_angle', 0.0)
+        self.imu.angular_velocity_covariance[4] = variances.get('imu_rate', 0.0)
+        self.imu.linear_acceleration_covariance[0] = -1.0
+        self.encoder = JointState(name=['hip'])
+        self.encoder.header.frame_id = 'hip'
+        self.contacts = {}
+        for leg in ('inner', 'outer'):
+            self.contacts[leg] = WrenchStamped()
+            self.contacts[leg].header.frame_id = f'{leg}_foot'
+
+    def destroy(self, node: Node) -> None:
+        """Take the topics off the graph."""
+        for publisher in self.publishers.values():
+            node.destroy_publisher(publisher)
+        self.publishers.clear()
+
+    def unheard(self, listeners: int, spared: tuple[str, ...] = (topics.HIP_COUNTS,)) -> list[str]:
+        """Topics with fewer subscriptions than `listeners`, less those that nobody records."""
+        return [
+            topic
+            for topic, publisher in self.publishers.items()
+            if topic not in spared and publisher.get_subscription_count() < listeners
+        ]
+
+    def publish_measurement(self, stamp_ns: int, measurement: Any) -> None:
+        """Publish what the sensors said at that time."""
+        self._publish_parts(to_stamp(stamp_ns), measurement)
+
+    def publish_applied(self, stamp_ns: int, torque: tuple[float, ...]) -> None:
+        """Publish the set-points latched at that time, in N m."""
+        self.applied.header.stamp = to_stamp(stamp_ns)
+        self.applied.effort = list(torque)
+        self.publishers[topics.APPLIED_TORQUE].publish(self.applied)
+
+    def _publish_compass_gait(self, stamp: Any, measurement: Any) -> None:
+        self.encoder.header.stamp = stamp
+        self.encoder.position = [measurement.outputs['hip_angle']]
+        self.publishers[topics.HIP_ENCODER].publish(self.encoder)
+        if 'hip_angle' in measurement.counts:
+            counts = Int64(data=int(measurement.counts['hip_angle']))
+            self.publishers[topics.HIP_COUNTS].publish(counts)
+        for leg, message in self.contacts.items():
+            message.header.stamp = stamp
+            message.wrench.force.z = float(measurement.contact.get(leg, 0.0))
+            self.publishers[topics.FOOT_CONTACT.format(leg=leg)].publish(message)
+        # Last, because controllers and the excitation answer this one.
+        half = 0.5 * measurement.outputs['imu_angle']
+        self.imu.header.stamp = stamp
+        self.imu.orientation.y = math.sin(half)
+        self.imu.orientation.w = math.cos(half)
+        self.imu.angular_velocity.y = float(measurement.outputs['imu_rate'])
+        self.publishers[topics.IMU].publish(self.imu)
+
+    def _publish_joints(self, stamp: Any, positions: list[float]) -> None:
+        self.joint_states.header.stamp = stamp
+        self.joint_states.position = positions
+        self.publishers[topics.JOINT_STATES].publish(self.joint_states)
+
+    def _publish_pendulum(self, stamp: Any, measurement: Any) -> None:
+        self._publish_joints(stamp, [measurement.outputs['angle']])
+
+    def _publish_double_pendulum(self, stamp: Any, measurement: Any) -> None:
+        outputs = measurement.outputs
+        self._publish_joints(stamp, [outputs['shoulder_angle'], outputs['elbow_angle']])
+
+
+def torques_of(message: JointState, joints: tuple[str, ...]) -> list[float]:
+    """Efforts of a command in the order of `joints`.
+
+    Raises:
+        ValueError: The message names other joints or holds fewer efforts than names.
+    """
+    names = list(message.name) or list(joints)
+    if sorted(names) != sorted(joints):
+        raise ValueError(f'command names {names}; expected {list(joints)}')
+    if len(message.effort) != len(names):
+        raise ValueError(f'command holds {len(message.effort)} efforts for {len(names)} joints')
+    return [float(message.effort[names.index(joint)]) for joint in joints]

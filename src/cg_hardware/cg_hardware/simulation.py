@@ -1,0 +1,192 @@
+"""The simulated machine apart from ROS: settings, loading, recording note, pace."""
+
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.plant import Plant
+from cg_dynamics.rig import Setup
+from cg_dynamics.settings import Settings, setting
+
+NOMINAL_MODEL = 'compass_gait_mit'
+SOFTWARE = 'compass-gait 0.1.0'
+NANOSECONDS = 1_000_000_000
+LOCKSTEP_EPOCH_NS = NANOSECONDS  # simulated time starts at 1 s: a stamp of zero means "unset"
+
+
+@dataclass(frozen=True)
+class SimulationSettings(Settings):
+    """Parameters of the simulation node."""
+
+    model_file: str = setting('', 'model file to simulate; empty for the nominal compass gait')
+    setup: str = setting('', 'what was done to the rig: YAML text, or a file that holds it')
+    seed: int = setting(0, 'seed of the sensor noise', minimum=0)
+    sample_rate_hz: float = setting(
+        500.0, 'rate of measurement and torque latching', unit='Hz', minimum=10.0, maximum=2000.0
+    )
+    mode: str = setting(
+        'real_time',
+        'clock of the machine: its own, or one tick per answered measurement',
+        choices=('real_time', 'lockstep'),
+    )
+    initial_state: tuple[float, ...] = setting(
+        (),
+        'coordinates of the set-up, then their rates, as in docs/conventions.md; empty for rest '
+        'at zero [rad, rad/s]',
+    )
+    duration: float = setting(
+        0.0, 'length of the run; 0 for as long as the node lives', unit='s', minimum=0.0
+    )
+    torque_limit: float = setting(
+        0.0, 'saturation of the drive; 0 takes the limit of the model', unit='N m', minimum=0.0
+    )
+    stale_after: float = setting(
+        0.02,
+        'real time: age beyond which a command counts as lost and the torque is zero',
+        unit='s',
+        minimum=0.001,
+        maximum=10.0,
+    )
+    answer_timeout: float = setting(
+        5.0,
+        'lock-step: longest wait for the answer to a measurement before the run is given up',
+        unit='s',
+        minimum=0.01,
+        maximum=600.0,
+    )
+    peer_timeout: float = setting(
+        20.0,
+        'longest wait, at the start, for recorders and (lock-step) a controller',
+        unit='s',
+        minimum=0.1,
+        maximum=600.0,
+    )
+    recorders: int = setting(
+        0,
+        'recorders that must have subscribed to every topic before the first sample, and '
+        'that a lock-step run never outpaces',
+        minimum=0,
+        maximum=10,
+    )
+    experiment: str = setting('', 'name of the experiment, for the recording note')
+    note_model_file: str = setting(
+        '',
+        'model file that the recording note names, where the machine deviates from it on '
+        'purpose; empty for model_file',
+    )
+    notes: str = setting('', 'free text for the recording note')
+    autostart: bool = setting(True, 'configure and activate without being asked')
+    exit_when_done: bool = setting(False, 'end the process after `duration` or a failure')
+
+
+def model_file_of(path: str) -> Path:
+    """The model file to use; empty means the nominal compass gait."""
+    return Path(path).expanduser() if path else model_path(NOMINAL_MODEL)
+
+
+def read_setup(text: str) -> Setup:
+    """Set-up from YAML text, or from the file of that name.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+    source = text
+    if text and '\n' not in text and ':' not in text:
+        try:
+            source = Path(text).expanduser().read_text(encoding='utf-8')
+        except OSError as error:
+            raise ValueError(f'setup: cannot read file {text!r}: {error.strerror}') from None
+    try:
+        entries = yaml.safe_load(source) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f'setup is not YAML: {" ".join(str(error).split())}') from None
+    return Setup.from_dict(entries)
+
+
+def build_plant(settings: SimulationSettings, model: Model, setup: Setup) -> Plant:
+    """The machine in its first state."""
+    state = np.array(settings.initial_state) if settings.initial_state else None
+    return Plant(
+        model,
+        setup,
+        initial_state=state,
+        sample_time=1.0 / settings.sample_rate_hz,
+        seed=settings.seed,
+    )
+
+
+def noise_variances(model: Model) -> dict[str, float]:
+    """Channel -> variance of its noise, in the channel's unit squared."""
+    return {
+        channel: sensor['noise'].value ** 2
+        for channel, sensor in model.sensors.items()
+        if 'noise' in sensor
+    }
+
+
+def recording_note(
+    settings: SimulationSettings, mechanism: str, setup: Setup, channels: list[str], zeroed_at: str
+) -> str:
+    """The YAML text of `/experiment`: docs/interfaces.md, "The recording note"."""
+    path = model_file_of(settings.note_model_file or settings.model_file)
+    rates = settings.initial_state[len(settings.initial_state) // 2 :]
+    note = {
+        'format': 'cg_recording/1',
+        'experiment': settings.experiment or 'unnamed',
+        'mechanism': mechanism,
+        'setup': setup.to_dict(),
+        'nominal_rate_hz': settings.sample_rate_hz,
+        'sensor_zeros': {name: 0.0 for name in channels if name.endswith('angle')},
+        'zeroed_at': zeroed_at,
+        'initial_state': 'moving' if any(rates) else 'rest',
+        'model_file': path.name,
+        'model_sha256': hashlib.sha256(path.read_bytes()).hexdigest(),
+        'software': SOFTWARE,
+        'notes': settings.notes,
+    }
+    return yaml.safe_dump(note, sort_keys=False, allow_unicode=True)
+
+
+def ticks_of(duration: float, rate_hz: float) -> int | None:
+    """Samples in a run of that many s; None for an endless one."""
+    return math.ceil(duration * rate_hz - 1e-9) if duration > 0.0 else None
+
+
+class Pace:
+    """Which samples are due on a clock, and how late they were taken.
+
+    A late machine catches up: no sample is ever left out, lateness is counted instead.
+    """
+
+    def __init__(self, rate_hz: float, start_ns: int):
+        self.period_ns = round(NANOSECONDS / rate_hz)
+        self.start_ns = start_ns
+        self.taken = 0
+        self.worst_ns = 0
+        self.late = 0
+
+    @property
+    def next_ns(self) -> int:
+        """When the next sample is due."""
+        return self.start_ns + self.taken * self.period_ns
+
+    def take(self, now_ns: int) -> bool:
+        """Take the next sample if it is due."""
+        lateness = now_ns - self.next_ns
+        if lateness < 0:
+            return False
+        self.taken += 1
+        self.worst_ns = max(self.worst_ns, lateness)
+        self.late += lateness > self.period_ns
+        return True
+
+    def forget(self) -> None:
+        """Start counting lateness anew."""
+        self.worst_ns = 0
+        self.late = 0

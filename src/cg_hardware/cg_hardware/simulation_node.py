@@ -1,0 +1,410 @@
+"""ROS node that stands in for the hardware: the simulated machine behind the real topics.
+
+The machine is cg_dynamics.plant, what may reach its drive is safety.py, and the messages are
+made in sensor_publishers.py. This node keeps the clock, in one of two modes.
+
+real_time   Samples are due on the machine's own clock. Each tick publishes the measurement,
+            latches the latest command that passes the gate, publishes it as applied, goes on.
+lockstep    The measurement stamped t goes out, then nothing moves until the command stamped t
+            is there. The same seed and peers give the same messages at any machine load. A peer
+            that does not answer in time ends the run, with zero torque.
+"""
+
+import time
+from datetime import datetime, timezone
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.model import Model
+from cg_dynamics.ros import (
+    IDLE_POLL,
+    LATCHED_QOS,
+    SENSOR_QOS,
+    DeclaredSettings,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
+from cg_hardware import topics
+from cg_hardware.safety import GateSettings, TorqueGate, judge
+from cg_hardware.sensor_publishers import SensorPublishers, torques_of
+from cg_hardware.simulation import (
+    LOCKSTEP_EPOCH_NS,
+    NANOSECONDS,
+    Pace,
+    SimulationSettings,
+    build_plant,
+    model_file_of,
+    noise_variances,
+    read_setup,
+    recording_note,
+    ticks_of,
+)
+
+CATCH_UP = 10  # samples taken at most before messages are looked at again
+RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
+REPEAT = 0.1  # s between repetitions of the first measurement of a lock-step run
+WARNING_PERIOD = 1.0  # s between equal warnings
+
+
+class SimulationNode(LifecycleNode):
+    """The simulated hardware."""
+
+    def __init__(self, **kwargs):
+        super().__init__('simulation_node', **kwargs)
+        self.plant = None
+        self.phase = 'off'  # off, gathering, running, finishing
+        self.finished = False
+        self.exit_status = 0
+        self.declared = DeclaredSettings(
+            self, SimulationSettings, at_work=lambda: self.plant is not None
+        )
+        self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self._next_diagnosis = 0.0
+        self._faults = 0
+        if self.settings.autostart:
+            self._start()
+
+    @property
+    def settings(self) -> SimulationSettings:
+        """The present settings."""
+        return self.declared.values
+
+    def _start(self) -> None:
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                raise ValueError('the simulated hardware could not start; see its log')
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load model and set-up, bring the topics up."""
+        try:
+            model = Model.load(model_file_of(self.settings.model_file))
+            setup = read_setup(self.settings.setup)
+            mechanism = model.mechanism.name
+            self.make_plant = lambda: build_plant(self.settings, model, setup)
+            plant = self.make_plant()
+            sensors = SensorPublishers(self, mechanism, noise_variances(model))
+        except (ValueError, OSError) as error:
+            self.get_logger().error(f'not configured: {error}')
+            return TransitionCallbackReturn.FAILURE
+        self.plant, self.sensors = plant, sensors
+        self.joints = sensors.joints
+        self.limit = self.settings.torque_limit or float(model.torque_limit)
+        gate = GateSettings(torque_limit=self.limit, stale_after=self.settings.stale_after)
+        self.gate = TorqueGate(gate, self.joints)
+        self.lockstep = self.settings.mode == 'lockstep'
+        self.zeroed_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
+        zeroed_at = datetime.fromtimestamp(self.zeroed_ns // NANOSECONDS, timezone.utc)
+        self.note = recording_note(
+            self.settings,
+            mechanism,
+            setup,
+            list(model.mechanism.outputs),
+            zeroed_at.strftime('%Y-%m-%dT%H:%M:%SZ'),
+        )
+        self.clock_publisher = (
+            self.create_publisher(Clock, topics.CLOCK, SENSOR_QOS) if self.lockstep else None
+        )
+        self.note_publisher = self.create_publisher(String, topics.EXPERIMENT, LATCHED_QOS)
+        self.command = self.create_subscription(
+            JointState, topics.TORQUE_COMMAND, self.on_command, SENSOR_QOS
+        )
+        self.progress: dict[str, int] = {}
+        self.progress_subscription = self.create_subscription(
+            Header, topics.RECORDER_PROGRESS, self.on_progress, SENSOR_QOS
+        )
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Publish the note, then start the clock as soon as all peers are there."""
+        others = self.count_publishers(topics.APPLIED_TORQUE) - 1
+        if others > 0:
+            self.get_logger().error(
+                f'{others} other publisher(s) of {topics.APPLIED_TORQUE} in this ROS domain; '
+                'one machine per ROS_DOMAIN_ID'
+            )
+            return TransitionCallbackReturn.FAILURE
+        self.note_publisher.publish(String(data=self.note))
+        self.plant = self.make_plant()
+        self.gate.drop('no command yet')
+        self.progress.clear()
+        self.phase = 'gathering'
+        self._deadline = time.monotonic() + self.settings.peer_timeout
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop the clock; the motor is without torque."""
+        self._stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take everything down that on_configure brought up."""
+        self._stop()
+        self.sensors.destroy(self)
+        for publisher in (self.clock_publisher, self.note_publisher):
+            if publisher is not None:
+                self.destroy_publisher(publisher)
+        self.destroy_subscription(self.command)
+        self.destroy_subscription(self.progress_subscription)
+        self.plant = None
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop, and end the process."""
+        self._stop()
+        self.finished = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def _stop(self) -> None:
+        self.phase = 'off'
+        if self.plant is not None:
+            self.gate.drop('not active')
+            self.plant.latch([0.0] * len(self.joints))
+
+    # What is due between messages
+
+    def poll(self) -> float:
+        """Do what is due; return the s until this wants to be asked again."""
+        now = time.monotonic()
+        if now >= self._next_diagnosis:
+            self._next_diagnosis = now + 1.0
+            self._publish_diagnostics()
+        if self.phase == 'gathering':
+            return self._gather(now)
+        if self.phase == 'finishing':
+            return self._finish(now)
+        if self.phase == 'running' and self.lockstep:
+            return self._poll_lockstep(now)
+        if self.phase == 'running':
+            return self._poll_real_time()
+        return IDLE_POLL
+
+    def _gather(self, now: float) -> float:
+        missing = self._missing_peers()
+        if missing and now > self._deadline:
+            self._fail(f'no {missing} after {self.settings.peer_timeout:g} s')
+        elif not missing:
+            self._begin()
+        return 0.005
+
+    def _missing_peers(self) -> str:
+        needed = self.settings.recorders
+        unheard = self.sensors.unheard(needed)
+        if unheard:
+            return f'recorder on {", ".join(unheard)}'
+        if len(self.progress) < needed:
+            return 'recorder that says it hears everything'
+        if self.lockstep and self.command.get_publisher_count() == 0:
+            return f'publisher of {topics.TORQUE_COMMAND}'
+        return ''
+
+    def _begin(self) -> None:
+        self.phase = 'running'
+        self.total = ticks_of(self.settings.duration, self.settings.sample_rate_hz)
+        self.ticks = 0
+        self.epoch_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
+        self.pace = Pace(self.settings.sample_rate_hz, time.monotonic_ns())
+        if self.lockstep:
+            self._present()
+
+    def _stamp(self) -> int:
+        return self.epoch_ns + round(self.ticks * NANOSECONDS / self.settings.sample_rate_hz)
+
+    def _publish_measurement(self) -> None:
+        if self.clock_publisher is not None:
+            self.clock_publisher.publish(Clock(clock=to_stamp(self._stamp())))
+        self._measurement = self.plant.measure()
+        self.sensors.publish_measurement(self._stamp(), self._measurement)
+
+    def _apply(self, torque: tuple[float, ...]) -> bool:
+        """Latch, publish what was latched, let one sample time pass; False if the run broke."""
+        self.plant.latch(torque)
+        self.sensors.publish_applied(self._stamp(), torque)
+        try:
+            self.plant.advance()
+        except SimulationError as error:
+            self._fail(str(error))
+            return False
+        self.ticks += 1
+        return True
+
+    # Real time
+
+    def _poll_real_time(self) -> float:
+        for _ in range(CATCH_UP):
+            if not self.pace.take(time.monotonic_ns()):
+                break
+            if self.total is not None and self.ticks >= self.total:
+                self._begin_to_finish()
+                return 0.0
+            self._publish_measurement()
+            judgement = self.gate.torque(self._clock_ns())
+            if judgement.doubt and judgement.doubt != 'no command yet':
+                self._doubt(judgement.doubt)
+            if not self._apply(judgement.torque):
+                return 0.0
+        return max(0.0, (self.pace.next_ns - time.monotonic_ns()) / NANOSECONDS)
+
+    def _clock_ns(self) -> int:
+        """The machine's clock: the stamps' epoch plus monotonic time, immune to clock changes."""
+        return self.epoch_ns + time.monotonic_ns() - self.pace.start_ns
+
+    def on_command(self, message: JointState) -> None:
+        """Take in a torque command."""
+        if self.phase != 'running':
+            return
+        try:
+            request = torques_of(message, self.joints)
+        except ValueError as error:
+            self.gate.drop(str(error))
+            self._doubt(str(error))
+            request = [0.0] * len(self.joints)
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        if self.lockstep:
+            self._answer(stamp_ns, request)
+            return
+        judgement = self.gate.offer(request, stamp_ns or self._clock_ns())
+        if judgement.doubt:
+            self._doubt(judgement.doubt)
+
+    # Lock-step
+
+    def _present(self) -> None:
+        """Publish the measurement whose answer the machine now waits for."""
+        self._publish_measurement()
+        self._awaiting = True
+        self._held_back = False
+        now = time.monotonic()
+        self._deadline = now + self.settings.answer_timeout
+        self._repeat_at = now + REPEAT
+
+    def _answer(self, stamp_ns: int, request: list[float]) -> None:
+        if not self._awaiting or stamp_ns != self._stamp():
+            return
+        judgement = judge(request, self.joints, self.limit)
+        if judgement.doubt:
+            self._doubt(judgement.doubt)
+        self._awaiting = False
+        if not self._apply(judgement.torque):
+            return
+        if self.total is not None and self.ticks >= self.total:
+            self._begin_to_finish()
+        else:
+            self._present_when_recorded()
+
+    def _present_when_recorded(self) -> None:
+        if self.settings.recorders and self.ticks >= RECORDER_WINDOW:
+            behind = self._stamp() - self._recorded_ns()
+            if behind > RECORDER_WINDOW * NANOSECONDS / self.settings.sample_rate_hz:
+                if not self._held_back:
+                    self._held_back = True
+                    self._deadline = time.monotonic() + self.settings.answer_timeout
+                return
+        self._present()
+
+    def _recorded_ns(self) -> int:
+        if len(self.progress) < self.settings.recorders:
+            return 0
+        return min(self.progress.values(), default=0)
+
+    def on_progress(self, message: Header) -> None:
+        """Note up to which stamp a recorder has stored everything."""
+        self.progress[message.frame_id] = to_nanoseconds(message.stamp)
+        if self.phase == 'running' and self.lockstep and self._held_back:
+            self._present_when_recorded()
+
+    def _poll_lockstep(self, now: float) -> float:
+        if self._awaiting and self.ticks == 0 and now > self._repeat_at:
+            # The controller may not have been matched yet when the first measurement went out.
+            self._repeat_at = now + REPEAT
+            self.sensors.publish_measurement(self._stamp(), self._measurement)
+        if now > self._deadline:
+            waited = f'{self.settings.answer_timeout:g} s'
+            if self._awaiting:
+                seconds = (self._stamp() - self.epoch_ns) / NANOSECONDS
+                self._fail(
+                    f'no {topics.TORQUE_COMMAND} stamped {self._stamp()} ns (answer to the '
+                    f'measurement at {seconds:.3f} s) within {waited}'
+                )
+            else:
+                self._fail(f'a recorder did not store anything for {waited}')
+        return IDLE_POLL
+
+    # Ends
+
+    def _begin_to_finish(self) -> None:
+        self.plant.latch([0.0] * len(self.joints))
+        self.phase = 'finishing'
+        self._last_ns = self.epoch_ns + round(
+            (self.ticks - 1) * NANOSECONDS / self.settings.sample_rate_hz
+        )
+        self._deadline = time.monotonic() + self.settings.answer_timeout
+
+    def _finish(self, now: float) -> float:
+        """Wait for the recorders, then deactivate."""
+        behind = self.settings.recorders and self._recorded_ns() < self._last_ns
+        if behind and now > self._deadline:
+            self._fail('a recorder did not store the last sample')
+        elif not behind:
+            self.get_logger().info(f'run of {self.ticks} samples is complete')
+            self.phase = 'off'
+            self.trigger_deactivate()
+            self.finished = self.settings.exit_when_done
+        return 0.005
+
+    def _fail(self, reason: str) -> None:
+        """Give the run up: zero torque, a clear message, no more measurements."""
+        self.get_logger().error(f'{reason}; torque is zero, the run is given up')
+        self._faults += 1
+        if self.phase == 'running':
+            self.sensors.publish_applied(self._stamp(), (0.0,) * len(self.joints))
+        self.trigger_deactivate()
+        self.exit_status = 1
+        self.finished = self.settings.exit_when_done
+
+    def _doubt(self, reason: str) -> None:
+        self._faults += 1
+        self.get_logger().warning(
+            f'torque command: {reason}', throttle_duration_sec=WARNING_PERIOD
+        )
+
+    def _publish_diagnostics(self) -> None:
+        status = DiagnosticStatus(name='simulation_node', hardware_id='simulation')
+        status.level = DiagnosticStatus.WARN if self._faults else DiagnosticStatus.OK
+        status.message = self.phase
+        values = {'commands_in_doubt': self._faults}
+        if self.phase == 'running':
+            values['samples'] = self.ticks
+            if not self.lockstep:
+                values['late_samples'] = self.pace.late
+                values['worst_lateness_ms'] = f'{self.pace.worst_ns / 1e6:.3f}'
+                if self.pace.late:
+                    status.level = DiagnosticStatus.WARN
+                self.pace.forget()
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = to_stamp(time.time_ns())
+        self.diagnostics.publish(array)
+        self._faults = 0
+
+    def close(self) -> None:
+        """Leave with zero torque, and say so on the topic."""
+        if self.phase == 'running':
+            self.sensors.publish_applied(self._stamp(), (0.0,) * len(self.joints))
+        self._stop()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_hardware simulation_node`."""
+    return run(SimulationNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
