@@ -1,0 +1,194 @@
+"""A recording on disk: from the first message to an ordinary bag. Pure; no ROS.
+
+While it runs, a recording is a directory that holds a journal (journal.py). `close` turns it
+into an ordinary rosbag2 directory; `recover.py` does the same for one that was never closed.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rosbags.typesys import Stores, get_typestore
+
+from cg_dynamics.settings import Settings, setting
+from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
+from cg_sysid.journal import Journal
+from cg_sysid.recover import JOURNAL_NAME, Recovered, recover
+
+STAMP = struct.Struct('<iI')  # at byte 4 of a serialised message that begins with a Header
+HEADER_OFFSET = 4
+WRENCH = 'geometry_msgs/msg/WrenchStamped'
+EXTRA_TOPICS = {
+    'compass_gait': {'/foot_contact/inner': WRENCH, '/foot_contact/outer': WRENCH},
+}
+TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+@dataclass(frozen=True)
+class RecorderSettings(Settings):
+    """Parameters of the recorder node."""
+
+    bag: str = setting('', 'directory to write, which must not exist yet')
+    mechanism: str = setting(
+        'compass_gait', 'whose topics to record', choices=tuple(MECHANISMS)
+    )
+    also: tuple[str, ...] = setting((), 'further topics, each as name:type')
+    time: str = setting(
+        'receipt',
+        'log time of a message: when it was received, or its own stamp (lock-step)',
+        choices=('receipt', 'stamp'),
+    )
+    depth: int = setting(
+        2000, 'messages of one topic that may wait to be stored', minimum=10, maximum=100000
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for entry in self.also:
+            if entry.count(':') != 1:
+                raise ValueError(f'also: {entry!r} is not of the form /topic:package/msg/Type')
+
+
+def topics_to_record(settings: RecorderSettings) -> dict[str, str]:
+    """Topic name -> message type of what the settings ask for.
+
+    Raises:
+        ValueError: A message type is unknown.
+    """
+    topics = {NOTE_TOPIC: STRING}
+    for topic in MECHANISMS[settings.mechanism].topics.values():
+        topics[topic.name] = topic.msgtype
+    topics |= EXTRA_TOPICS.get(settings.mechanism, {})
+    for entry in settings.also:
+        name, msgtype = entry.split(':')
+        topics[name] = msgtype
+    for name, msgtype in topics.items():
+        if msgtype not in TYPESTORE.fielddefs:
+            raise ValueError(f'{name}: message type {msgtype!r} is not known')
+    return topics
+
+
+def needed_topics(settings: RecorderSettings) -> tuple[str, ...]:
+    """Topics that must have a publisher before the recorder calls itself ready."""
+    mechanism = MECHANISMS[settings.mechanism]
+    topics = [NOTE_TOPIC, mechanism.torque.name, *(topic.name for topic in mechanism.outputs)]
+    topics += EXTRA_TOPICS.get(settings.mechanism, {})
+    if settings.time == 'stamp':
+        topics.append(mechanism.command.name)
+    return tuple(topics)
+
+
+def is_stamped(msgtype: str) -> bool:
+    """Whether messages of this type begin with a Header."""
+    _, fields = TYPESTORE.fielddefs[msgtype]
+    return bool(fields) and fields[0][0] == 'header'
+
+
+@dataclass
+class RecordedTopic:
+    """A topic that has delivered at least one message."""
+
+    channel: int
+    stamped: bool
+    count: int = 0
+    newest_ns: int = 0
+
+
+class Recording:
+    """One bag being written.
+
+    Attributes:
+        path: The bag directory.
+        messages: Messages stored so far.
+    """
+
+    def __init__(self, path: Path, topics: dict[str, str], by_stamp: bool):
+        """Create the directory and the journal in it.
+
+        Args:
+            path: The bag directory, which must not exist yet.
+            topics: Topic name -> message type.
+            by_stamp: Log messages at their own stamps instead of their receipt.
+
+        Raises:
+            ValueError: There is no path, or something is there already.
+        """
+        if not str(path) or str(path) == '.':
+            raise ValueError('bag is empty; name the directory to write')
+        if path.exists():
+            raise ValueError(f'{path} exists already; recordings are never overwritten')
+        path.mkdir(parents=True)
+        self.path = path
+        self.messages = 0
+        self._types = topics
+        self._by_stamp = by_stamp
+        self._journal = Journal(path / JOURNAL_NAME)
+        self._topics: dict[str, RecordedTopic] = {}
+        self._waiting: list[tuple[str, bytes]] = []
+        self._first_ns: int | None = None
+
+    def knows(self, topic: str) -> bool:
+        """Whether the topic has been announced."""
+        return topic in self._topics
+
+    def announce(self, topic: str, qos_profiles: list[dict[str, Any]]) -> None:
+        """Open a channel for the topic, with the QoS that its publishers offer."""
+        msgtype = self._types[topic]
+        definition, _ = TYPESTORE.generate_msgdef(msgtype, ros_version=2)
+        metadata = {'offered_qos_profiles': yaml.safe_dump(qos_profiles) if qos_profiles else ''}
+        channel = self._journal.add_channel(topic, msgtype, definition, metadata)
+        self._topics[topic] = RecordedTopic(channel, is_stamped(msgtype))
+
+    def write(self, topic: str, data: bytes, receipt_ns: int, now: float) -> None:
+        """Store one serialised message of an announced topic.
+
+        Args:
+            topic: Its name.
+            data: The message in CDR.
+            receipt_ns: When it came in, in ns of the clock that the bag is to show.
+            now: Monotonic time in s, by which chunks are closed.
+        """
+        recorded = self._topics[topic]
+        if recorded.stamped:
+            seconds, nanoseconds = STAMP.unpack_from(data, HEADER_OFFSET)
+            stamp_ns = seconds * 1_000_000_000 + nanoseconds
+            if self._by_stamp and stamp_ns <= recorded.newest_ns:
+                return  # lock-step repeats its first sample until somebody answers
+            recorded.newest_ns = max(recorded.newest_ns, stamp_ns)
+        elif self._by_stamp:
+            if self._first_ns is None:
+                # It has no time of its own: it gets that of the first stamped message.
+                self._waiting.append((topic, data))
+                return
+            stamp_ns = self._first_ns
+        else:
+            stamp_ns = receipt_ns
+        if self._by_stamp and self._first_ns is None:
+            self._first_ns = stamp_ns
+            waiting, self._waiting = self._waiting, []
+            for early_topic, early_data in waiting:
+                self.write(early_topic, early_data, receipt_ns, now)
+        log_ns = stamp_ns if self._by_stamp else receipt_ns
+        self._journal.write(recorded.channel, recorded.count, log_ns, stamp_ns, data, now)
+        recorded.count += 1
+        self.messages += 1
+
+    def flush_if_due(self, now: float) -> float:
+        """Hand old messages to the operating system; return the s until that is due again."""
+        return self._journal.flush_if_due(now)
+
+    @property
+    def complete_until_ns(self) -> int:
+        """Stamp up to which every stamped topic that has spoken is stored; 0 before that."""
+        stamps = [topic.newest_ns for topic in self._topics.values() if topic.stamped]
+        return min(stamps, default=0)
+
+    def close(self) -> Recovered:
+        """End the recording and make it an ordinary bag."""
+        for topic, data in self._waiting:
+            recorded = self._topics[topic]
+            self._journal.write(recorded.channel, recorded.count, 0, 0, data, 0.0)
+        self._journal.close()
+        return recover(self.path)

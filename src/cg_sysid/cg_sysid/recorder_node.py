@@ -1,0 +1,157 @@
+"""ROS node of the recorder: raw subscriptions into a bag. What is on disk: recorder.py.
+
+A SIGKILL at any moment loses the last 10 ms or so; `ros2 run cg_sysid recover BAG` makes a bag
+of the rest. SIGINT and SIGTERM close the bag properly.
+"""
+
+import functools
+import importlib
+import time
+from pathlib import Path
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Header
+
+from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run, to_stamp
+from cg_sysid.channels import NOTE_TOPIC
+from cg_sysid.recorder import RecorderSettings, Recording, needed_topics, topics_to_record
+
+PROGRESS_TOPIC = '/recorder/progress'
+PROGRESS_PERIOD = 0.002  # s
+READY_PERIOD = 0.02  # s
+
+
+class RecorderNode(Node):
+    """Records the topics of one machine."""
+
+    def __init__(self, **kwargs):
+        super().__init__('recorder', **kwargs)
+        self.finished = False
+        self.exit_status = 0
+        settings = DeclaredSettings(self, RecorderSettings).values
+        topics = topics_to_record(settings)
+        self.recording = Recording(
+            Path(settings.bag).expanduser(), topics, settings.time == 'stamp'
+        )
+        # Waiting messages of all topics share one thread; the depth rides out a busy machine.
+        qos = QoSProfile(depth=settings.depth, reliability=ReliabilityPolicy.RELIABLE)
+        self.progress = self.create_publisher(Header, PROGRESS_TOPIC, SENSOR_QOS)
+        self._progress = Header(frame_id=self.get_fully_qualified_name())
+        self._told_ns = 0
+        self._told_at = 0.0
+        self.subscriptions_to = {}
+        self.needed = needed_topics(settings)
+        for topic, msgtype in topics.items():
+            self.subscriptions_to[topic] = self.create_subscription(
+                message_class(msgtype),
+                topic,
+                functools.partial(self.on_message, topic),
+                LATCHED_QOS if topic == NOTE_TOPIC else qos,
+                raw=True,
+            )
+        self.get_logger().info(f'recording {len(topics)} topics to {self.recording.path}')
+
+    def on_message(self, topic: str, serialised: bytes) -> None:
+        """Store a message."""
+        if self.finished:
+            return
+        try:
+            if not self.recording.knows(topic):
+                self.recording.announce(topic, self._offered_qos(topic))
+            self.recording.write(topic, serialised, time.time_ns(), time.monotonic())
+        except OSError as error:
+            self._fail(error)
+
+    def poll(self) -> float:
+        """Close chunks that are old enough, tell how far the recording has come."""
+        now = time.monotonic()
+        if self.finished:
+            return 0.0
+        try:
+            wait = self.recording.flush_if_due(now)
+        except OSError as error:
+            self._fail(error)
+            return 0.0
+        stored_ns = self.recording.complete_until_ns
+        if stored_ns == 0:
+            # Until the first sample, a progress of zero says that this recorder hears everything.
+            if now > self._told_at + READY_PERIOD and self._hears_all():
+                self._told_at = now
+                self.progress.publish(self._progress)
+        elif stored_ns != self._told_ns:
+            if now < self._told_at + PROGRESS_PERIOD:
+                return PROGRESS_PERIOD
+            self._told_ns, self._told_at = stored_ns, now
+            self._progress.stamp = to_stamp(stored_ns)
+            self.progress.publish(self._progress)
+        return wait
+
+    def _hears_all(self) -> bool:
+        # Asked of the readers: a writer that has matched a reader may not be matched by it yet.
+        return all(self.subscriptions_to[topic].get_publisher_count() for topic in self.needed)
+
+    def _fail(self, error: OSError) -> None:
+        self.get_logger().error(f'recording stopped: {error}')
+        self.finished, self.exit_status = True, 1
+
+    def _offered_qos(self, topic: str) -> list[dict]:
+        return [
+            qos_entry(info.qos_profile) for info in self.get_publishers_info_by_topic(topic)
+        ]
+
+    def close(self) -> None:
+        """Make the recording an ordinary bag."""
+        if self.recording.messages == 0:
+            self.get_logger().warning('nothing was recorded')
+        try:
+            result = self.recording.close()
+        except (ValueError, OSError) as error:
+            self.get_logger().error(f'{self.recording.path}: {error}')
+            self.exit_status = 1
+            return
+        self.get_logger().info(f'{result.messages} messages in {result.path}')
+
+
+def message_class(msgtype: str) -> type:
+    """The class of a message type such as sensor_msgs/msg/Imu."""
+    package, _, name = msgtype.partition('/msg/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError):
+        raise ValueError(f'message type {msgtype!r} is not installed') from None
+
+
+def qos_entry(profile: QoSProfile) -> dict:
+    """A QoS profile in the form of rosbag2's `offered_qos_profiles`."""
+    # Discovery tells neither history nor depth; rosbag2 writes them as unknown, 0.
+    durability = {
+        DurabilityPolicy.TRANSIENT_LOCAL: 'transient_local',
+        DurabilityPolicy.VOLATILE: 'volatile',
+    }
+    reliability = {
+        ReliabilityPolicy.RELIABLE: 'reliable',
+        ReliabilityPolicy.BEST_EFFORT: 'best_effort',
+    }
+    forever = {'sec': 9223372036, 'nsec': 854775807}
+    known = profile.history == HistoryPolicy.KEEP_LAST
+    return {
+        'history': 'keep_last' if known else 'unknown',
+        'depth': profile.depth if known else 0,
+        'reliability': reliability.get(profile.reliability, 'unknown'),
+        'durability': durability.get(profile.durability, 'unknown'),
+        'deadline': forever,
+        'lifespan': forever,
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': forever,
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_sysid recorder_node`."""
+    return run(RecorderNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
