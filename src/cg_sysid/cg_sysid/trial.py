@@ -1,0 +1,158 @@
+"""A trial: one record made ready for simulation beside it.
+
+Arrays in the order of the model's channels, standard deviations that say how well each channel
+can be matched at all, and a first guess of the motion at the first row.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from cg_dynamics.mechanisms import Mechanism
+from cg_dynamics.mechanisms import mechanism as mechanism_named
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+from cg_sysid.noise import measure_noise
+from cg_sysid.record import Record
+
+START_WINDOW = 0.03  # s of data behind the first guess of the initial motion
+# A floor below the noise that is stated or measured would let rounding decide.
+SMALLEST_SIGMA = {'rad': 1e-6, 'rad/s': 1e-5}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A record as arrays.
+
+    Attributes:
+        name: Name of the record.
+        time: Stamps of the rows in s from the first, shape (n,).
+        inputs: Held inputs, shape (n, nu), in the order of `input_names`.
+        input_names: Input channels.
+        outputs: Measured outputs, NaN where there is no sample, shape (n, ny).
+        sigma: Noise floor of each output (white noise and rounding), shape (ny,).
+        setup: The set-up.
+        motion: First guess of the free coordinates and rates at the first row, shape (2m,).
+        motion_sigma: How far the guess may be off, one standard deviation, shape (2m,).
+    """
+
+    name: str
+    time: np.ndarray
+    inputs: np.ndarray
+    input_names: tuple[str, ...]
+    outputs: np.ndarray
+    sigma: np.ndarray
+    setup: Setup
+    motion: np.ndarray
+    motion_sigma: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """Length in s."""
+        return float(self.time[-1])
+
+
+def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
+    """Trials of records that belong to one model's machine.
+
+    The noise of a channel is what the model file states or what the records show, whichever is
+    larger, one value for all records: a sensor does not change from one record to the next.
+
+    Raises:
+        ValueError: if a record is of another mechanism.
+    """
+    body = model.mechanism
+    for record in records:
+        if record.mechanism != body.name:
+            raise ValueError(
+                f'record {record.name!r} is of a {record.mechanism}, the model {model.name!r} '
+                f'of a {body.name}'
+            )
+    sigma = noise_floor(model, records)
+    return [_trial(body, record, sigma) for record in records]
+
+
+def noise_floor(model: Model, records: Sequence[Record]) -> np.ndarray:
+    """Noise floor of each output channel in its unit, shape (ny,)."""
+    measured: dict[str, list[float]] = {}
+    for record in records:
+        for channel, noise in measure_noise(record).items():
+            measured.setdefault(channel, []).append(noise.sigma_floor)
+    floor = []
+    for channel, unit in zip(model.mechanism.outputs, model.mechanism.output_units, strict=True):
+        sensor = model.sensors.get(channel, {})
+        stated = np.hypot(
+            sensor['noise'].value if 'noise' in sensor else 0.0,
+            sensor['resolution'].value / np.sqrt(12) if 'resolution' in sensor else 0.0,
+        )
+        seen = np.median(measured[channel]) if channel in measured else 0.0
+        floor.append(max(stated, seen, SMALLEST_SIGMA[unit]))
+    return np.array(floor)
+
+
+def _trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
+    time = record.time
+    names = (*body.inputs, *(name for name in record.inputs if name not in body.inputs))
+    outputs = np.column_stack(
+        [record.outputs.get(channel, np.full(len(time), np.nan)) for channel in body.outputs]
+    )
+    motion, motion_sigma = _initial_motion(body, record.setup, time, outputs, sigma)
+    return Trial(
+        name=record.name,
+        time=time,
+        inputs=np.column_stack([record.inputs[name] for name in names]),
+        input_names=names,
+        outputs=outputs,
+        sigma=sigma,
+        setup=record.setup,
+        motion=motion,
+        motion_sigma=motion_sigma,
+    )
+
+
+def sensor_matrix(body: Mechanism, setup: Setup) -> np.ndarray:
+    """Outputs of ideal sensors as a matrix on (s, ds/dt), shape (ny, 2m): all are linear."""
+    basis = body.kinematics(setup).basis
+    m = basis.shape[1]
+    s, ds = ca.SX.sym('s', m), ca.SX.sym('ds', m)
+    ideal = body.sensors(ca.mtimes(basis, s), ca.mtimes(basis, ds))
+    stacked = ca.vertcat(*ideal.values())
+    jacobian = ca.Function('c', [s, ds], [ca.jacobian(stacked, ca.vertcat(s, ds))])
+    return np.asarray(ca.DM(jacobian(np.zeros(m), np.zeros(m))))
+
+
+def _initial_motion(
+    body: Mechanism, setup: Setup, time: np.ndarray, outputs: np.ndarray, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    # Value and slope of each channel over a short window, then least squares on (s, ds/dt):
+    # the slope of an angle is a rate, so encoders alone give rates too.
+    matrix = sensor_matrix(body, setup)
+    m2 = matrix.shape[1]
+    m = m2 // 2
+    window = time <= max(START_WINDOW, time[min(6, len(time) - 1)])
+    rows, values, weights = [], [], []
+    for j, unit in enumerate(body.output_units):
+        here = window & np.isfinite(outputs[:, j])
+        if here.sum() < 3:
+            continue
+        t, y = time[here], outputs[here, j]
+        degree = 2 if here.sum() >= 8 else 1
+        design = np.vander(t, degree + 1, increasing=True)
+        coefficients, *_ = np.linalg.lstsq(design, y, rcond=None)
+        spread = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+        rows.append(matrix[j])
+        values.append(coefficients[0])
+        weights.append(1 / (sigma[j] * spread[0]))
+        if unit == 'rad':
+            rows.append(np.concatenate([np.zeros(m), matrix[j, :m]]))
+            values.append(coefficients[1])
+            weights.append(1 / (sigma[j] * spread[1]))
+    a, b, w = np.array(rows), np.array(values), np.array(weights)
+    motion, *_ = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)
+    information = (a * w[:, None]).T @ (a * w[:, None])
+    spread = np.sqrt(np.diag(np.linalg.pinv(information)))
+    # The window's polynomial is itself an approximation: be generous.
+    return motion, 10 * spread + np.concatenate([np.full(m, 1e-3), np.full(m, 1e-1)])
+
