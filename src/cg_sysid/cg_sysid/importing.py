@@ -130,8 +130,8 @@ def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> I
         raise RecordingError(f'{data_dir}: no file matches {", ".join(patterns)}')
     for path in found:
         table = read_table(path)
-        for rows in _parts(mapping, table, path):
-            yield _record_of(mapping, path, table, rows)
+        for number, rows in enumerate(_parts(mapping, table, path), start=1):
+            yield _record_of(mapping, path, table, rows, number)
 
 
 def _parts(mapping: dict, table: Table, path: Path) -> Iterator[np.ndarray]:
@@ -145,13 +145,19 @@ def _parts(mapping: dict, table: Table, path: Path) -> Iterator[np.ndarray]:
         raise RecordingError(f'{path}: no row is left after the filters in `rows`')
     split = mapping.get('split') or {}
     _check_entries(
-        split, {'by', 'name', 'drop_first', 'drop_last', 'min_rows'}, f'{path}: split'
+        split, {'by', 'at', 'name', 'drop_first', 'drop_last', 'min_rows'}, f'{path}: split'
     )
     changes = np.diff(rows) != 1  # rows that were filtered out also end a part
     if not split:
         changes[:] = False
     for name in split.get('by', []):
+        if name not in table:
+            raise RecordingError(f'{path}: split.by: no column {name!r}; '
+                                 f'the file has {", ".join(table)}')
         changes |= table[name][rows][1:] != table[name][rows][:-1]
+    for border in split.get('at', []):
+        values = column(table, border.get('column'), f'{path}: split.at')[rows]
+        changes |= (values[:-1] < border['value']) & (values[1:] >= border['value'])
     first, last = split.get('drop_first', 0), split.get('drop_last', 0)
     for part in np.split(rows, np.flatnonzero(changes) + 1):
         kept = part[first:len(part) - last]
@@ -176,7 +182,9 @@ def _matches(rule: Any, table: Table, where: str) -> np.ndarray:
     return matches
 
 
-def _record_of(mapping: dict, path: Path, table: Table, rows: np.ndarray) -> Imported:
+def _record_of(
+    mapping: dict, path: Path, table: Table, rows: np.ndarray, number: int
+) -> Imported:
     part = {name: values[rows] for name, values in table.items()}
     where = f'{path}: mapping {mapping["name"]}'
     entries = _with_case(mapping, part, where)
@@ -195,7 +203,7 @@ def _record_of(mapping: dict, path: Path, table: Table, rows: np.ndarray) -> Imp
         note['nominal_rate_hz'] = float(rate)
     is_input = {*mechanism.input_names, *mechanism.extra_input_names}
     record = Record(
-        name=_part_name(mapping, path, part),
+        name=_part_name(mapping, path, part, number),
         stamp_ns=stamps,
         inputs={c: v for c, v in signals.items() if c in is_input},
         outputs={c: v for c, v in signals.items() if c not in is_input},
@@ -262,14 +270,14 @@ def _start(start: Any, path: Path) -> int:
     return int(instant.timestamp()) * NS_PER_S
 
 
-def _part_name(mapping: dict, path: Path, part: Table) -> str:
-    """Name of a part: the mapping's, the file's, and the values that it was split by."""
+def _part_name(mapping: dict, path: Path, part: Table, number: int) -> str:
+    """Name of a part: the mapping's, the file's, its number, values that it was split by."""
     template = (mapping.get('split') or {}).get('name')
     if template is None:
         return f'{mapping["name"]}_{path.stem}'
     firsts = {name: _plain(values[0]) for name, values in part.items()}
     try:
-        return template.format(name=mapping['name'], stem=path.stem, **firsts)
+        return template.format(name=mapping['name'], stem=path.stem, part=number, **firsts)
     except (KeyError, ValueError, IndexError) as error:
         msg = f'{path}: split.name {template!r} cannot be filled: {error}'
         raise RecordingError(msg) from None

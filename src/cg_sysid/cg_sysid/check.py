@@ -1,0 +1,136 @@
+"""Check of a recording before any fit: is it what it claims to be, and what is it good for?
+
+    python3 -m cg_sysid.check BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
+
+The checks themselves are in check_timing.py (stamps), check_signals.py (single signals),
+check_kinematics.py (IMU against itself) and check_content.py (note, coverage, feedback).
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from cg_sysid.bags import RawRecording, parse_note, read_raw, to_record
+from cg_sysid.check_content import check_content
+from cg_sysid.check_kinematics import check_kinematics
+from cg_sysid.check_signals import check_signals, read_signals
+from cg_sysid.check_timing import check_timing
+from cg_sysid.errors import RecordingError
+from cg_sysid.findings import CheckReport, Finding, make_report
+
+
+def check_recording(
+    recording: str | Path | RawRecording,
+    model: str | Path | None = None,
+    use_region: Mapping[str, tuple[float, float]] | None = None,
+    note: Mapping[str, Any] | None = None,
+) -> CheckReport:
+    """Check a recording.
+
+    Args:
+        recording: Path of a bag, or a recording as `read_raw` returns it.
+        model: Model file that the recording is about to be used with.
+        use_region: Quantity -> (lowest, highest) value at which the model will be used, for
+            channels and rates of angles, such as `{'hip_angle_rate': (-2.0, 2.0)}`.
+        note: Recording note for a bag that carries none.
+
+    Returns:
+        The findings. A bag that cannot be read at all gives the one finding `unreadable`.
+    """
+    try:
+        raw = recording if isinstance(recording, RawRecording) else read_raw(recording, note)
+        setup_error = _setup_error(raw)
+    except RecordingError as error:
+        name = Path(str(recording)).name
+        return make_report(name, [Finding('unreadable', 'error', '', str(error))])
+    if setup_error:
+        return make_report(raw.name, [setup_error])
+    signals = read_signals(raw)
+    findings = [
+        *check_timing(raw),
+        *check_signals(raw, signals),
+        *check_kinematics(signals),
+        *check_content(raw, signals, model, use_region),
+    ]
+    if not any(finding.severity == 'error' for finding in findings):
+        findings += _refused(raw)
+    return make_report(raw.name, _once(findings))
+
+
+def _setup_error(raw: RawRecording) -> Finding | None:
+    try:
+        _ = raw.setup
+    except RecordingError as error:
+        return Finding('setup_wrong', 'error', '', str(error))
+    return None
+
+
+def _refused(raw: RawRecording) -> list[Finding]:
+    """What reading refuses must never pass as usable."""
+    try:
+        to_record(raw)
+    except RecordingError as error:
+        return [Finding('refused', 'error', '', str(error))]
+    return []
+
+
+def _once(findings: list[Finding]) -> list[Finding]:
+    """Findings without repeats: one code per channel and place is enough."""
+    seen, kept = set(), []
+    for finding in findings:
+        key = (finding.code, finding.where, finding.start_s)
+        if key not in seen:
+            seen.add(key)
+            kept.append(finding)
+    return kept
+
+
+def parse_region(text: str) -> tuple[str, tuple[float, float]]:
+    """A region of use such as `hip_angle_rate=-2:2`.
+
+    Raises:
+        ValueError: The text is none.
+    """
+    name, _, limits = text.partition('=')
+    low, colon, high = limits.partition(':')
+    if not name or not colon:
+        msg = f'use region {text!r}: expected NAME=LOW:HIGH, such as hip_angle=-0.3:0.3'
+        raise ValueError(msg)
+    return name, (float(low), float(high))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line: check recordings. Exit code 0 if all are usable, 1 otherwise."""
+    parser = argparse.ArgumentParser(prog='check', description='Check recordings before use.')
+    parser.add_argument('bags', nargs='+', help='bag directories')
+    parser.add_argument('--json', action='store_true', help='print JSON')
+    parser.add_argument('--model', help='model file that the recordings will be used with')
+    parser.add_argument('--note', help='YAML file with the recording note, for bags without one')
+    parser.add_argument('--use-region', action='append', default=[], metavar='NAME=LOW:HIGH',
+                        help='where the model will be used; may be repeated')
+    args = parser.parse_args(argv)
+    try:
+        region = dict(parse_region(text) for text in args.use_region)
+        note = parse_note(Path(args.note).read_text('utf-8'), args.note) if args.note else None
+        if args.model and not Path(args.model).is_file():
+            raise RecordingError(f'{args.model}: no such model file')
+    except (OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    reports = [check_recording(bag, args.model, region, note) for bag in args.bags]
+    if args.json:
+        print(json.dumps([report.to_dict() for report in reports], indent=1, default=float))
+    else:
+        console = Console()
+        for report in reports:
+            report.print(console)
+    return 1 if any(report.verdict == 'unusable' for report in reports) else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,215 @@
+"""Checks of the stamps: rate, gaps, order, and agreement with the recorder's clock."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cg_sysid.bags import RawRecording, RawTopic
+from cg_sysid.channels import NOTE_TOPIC, TORQUE_COMMAND, mechanism
+from cg_sysid.findings import Finding
+from cg_sysid.record import NS_PER_S
+
+GAP = 2.5  # a spacing this many times the usual one lacks samples, [1]
+LONG_GAP_S = 0.1  # a torque that changed over a gap this long is not known, in s
+LOST_SHARE = 0.2  # share of lost samples that makes a topic useless, [1]
+RATE_TOLERANCE = 0.05  # of the nominal rate, [1]
+RATE_CHANGE = 0.15  # lasting change of the rate midway, [1]
+RATE_BLOCK = 25  # samples per block when looking for a change of rate
+CLOCK_JUMP_S = 0.02  # step between stamp and recorder's clock, in s
+LATE_S = 0.5  # a topic that starts later or ends earlier than the others by this, in s
+REGULAR = 0.3  # see bags.REGULAR_AFTER_SORTING
+SAME_CLOCK = 0.05  # durations by stamp and by recorder agree to this: not lock-step, [1]
+
+
+def check_timing(raw: RawRecording) -> Iterator[Finding]:
+    """Findings about the stamps of every topic of a recording.
+
+    A torque command is sent whenever there is one, so that only its order is checked.
+    """
+    stamps = [t.stamp_ns for t in raw.topics.values() if len(t)]
+    if not stamps:
+        return
+    origin = min(int(s.min()) for s in stamps)
+    yield from _overlap(raw, origin)
+    for topic in raw.topics.values():
+        if len(topic) < 2:
+            yield Finding('too_few_samples', 'error', topic.name,
+                          f'{len(topic)} sample(s); at least 2 are needed',
+                          value=len(topic), allowed=2)
+            continue
+        yield from _order(topic, origin)
+        if topic.name in (NOTE_TOPIC, TORQUE_COMMAND):
+            continue
+        yield from _clock(topic, origin)
+        yield from _gaps(raw, topic, origin)
+        yield from _rate(topic, raw.note.get('nominal_rate_hz'), origin)
+
+
+def _seconds(stamp_ns: int | np.integer, origin: int) -> float:
+    return (int(stamp_ns) - origin) / NS_PER_S
+
+
+def _overlap(raw: RawRecording, origin: int) -> Iterator[Finding]:
+    """Topics that do not span the recording."""
+    known = mechanism(raw.mechanism)
+    names = [t.name for t in (known.torque, *known.outputs) if len(raw.topics.get(t.name, ()))]
+    spans = {n: (raw.topics[n].stamp_ns.min(), raw.topics[n].stamp_ns.max()) for n in names}
+    if len(spans) < 2:
+        return
+    start, stop = max(s for s, _ in spans.values()), min(e for _, e in spans.values())
+    if start >= stop:
+        late = max(spans, key=lambda n: spans[n][0])
+        yield Finding('no_overlap', 'error', late,
+                      'the topics share no time: this one begins after another has ended',
+                      _seconds(spans[late][0], origin))
+        return
+    first, last = min(s for s, _ in spans.values()), max(e for _, e in spans.values())
+    for name, (begin, end) in spans.items():
+        if begin - first > LATE_S * NS_PER_S:
+            at = _seconds(begin, origin)
+            yield Finding('starts_late', 'warning', name, f'first sample only after {at:.2f} s',
+                          0.0, at, 0, at, LATE_S)
+        if last - end > LATE_S * NS_PER_S:
+            begin_s, end_s = _seconds(end, origin), _seconds(last, origin)
+            yield Finding('ends_early', 'warning', name,
+                          f'no sample in the last {end_s - begin_s:.2f} s', begin_s, end_s,
+                          len(raw.topics[name]) - 1, end_s - begin_s, LATE_S)
+
+
+def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
+    """Stamps that repeat or run backwards."""
+    stamp = topic.stamp_ns
+    step = np.diff(stamp)
+    backward = np.flatnonzero(step < 0)
+    if len(backward):
+        k = int(backward[0]) + 1
+        spacing = np.diff(np.unique(stamp))
+        harmless = spacing.min(initial=0) >= REGULAR * np.median(spacing)
+        yield Finding(
+            'time_backwards', 'warning' if harmless else 'error', topic.name,
+            f'stamps run backwards {len(backward)} time(s), first by {-step[k - 1] / 1e6:.3g} ms'
+            + ('; sorting restores their order' if harmless else ''),
+            _seconds(stamp[k], origin), _seconds(stamp[k - 1], origin), k,
+            float(step[k - 1]) / NS_PER_S, 0.0)
+    order = np.argsort(stamp, kind='stable')
+    repeats = np.flatnonzero(np.diff(stamp[order]) == 0)
+    if len(repeats):
+        k = int(order[repeats[0] + 1])
+        conflict = any(
+            np.any(v[order][repeats] != v[order][repeats + 1]) for v in topic.values.values()
+        )
+        yield Finding(
+            'duplicates', 'error' if conflict else 'warning', topic.name,
+            f'{len(repeats)} stamp(s) occur twice'
+            + (' with different values' if conflict else '; the copies are dropped'),
+            _seconds(stamp[k], origin), sample=k, value=len(repeats), allowed=0)
+
+
+def _clock(topic: RawTopic, origin: int) -> Iterator[Finding]:
+    """Steps between the stamps and the recorder's clock.
+
+    In lock-step simulation the two clocks run at different speeds and say nothing about each
+    other.
+    """
+    stamp, log = topic.stamp_ns, topic.log_ns
+    by_stamp, by_log = np.ptp(stamp), np.ptp(log)
+    if not by_stamp or not by_log:
+        return
+    offset = (log - stamp).astype(float) / NS_PER_S
+    n = 15
+    if len(offset) < 4 * n:
+        return
+    # Late arrivals come and go and only add to the offset; a clock that jumps moves its floor.
+    windows = np.lib.stride_tricks.sliding_window_view(offset, n).min(axis=1)
+    change = windows[n:] - windows[:-n]  # sample k = index + n
+    k = int(np.argmax(np.abs(change))) + n
+    before, after = np.median(windows[:max(1, k - n)]), np.median(windows[k:])
+    lasting = after - before
+    steady = np.median(np.abs(np.diff(log) - np.diff(stamp))) < 0.25 * np.median(np.diff(stamp))
+    if not steady or abs(change[k - n]) < CLOCK_JUMP_S or abs(lasting) < 0.5 * CLOCK_JUMP_S:
+        return
+    jumps = np.abs(np.diff(offset))
+    near = slice(max(0, k - n), min(len(jumps), k + n))
+    k = near.start + int(np.argmax(jumps[near])) + 1
+    in_log = abs(log[k] - log[k - 1] - np.median(np.diff(log)))
+    in_stamp = abs(stamp[k] - stamp[k - 1] - np.median(np.diff(stamp)))
+    guilty = 'stamp' if in_stamp > in_log else "recorder's"
+    yield Finding(
+        'clock_jump', 'error' if guilty == 'stamp' else 'warning', topic.name,
+        f'the {guilty} clock jumps by {1e3 * abs(lasting):.0f} ms against the other',
+        _seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), k, float(lasting),
+        CLOCK_JUMP_S)
+
+
+def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
+    """Spacings that lack samples."""
+    order = np.argsort(topic.stamp_ns, kind='stable')
+    stamp = topic.stamp_ns[order]
+    spacing = np.diff(stamp)
+    positive = spacing[spacing > 0]
+    if not len(positive):
+        return
+    usual = float(np.median(positive))
+    gaps = np.flatnonzero(spacing > GAP * usual)
+    if not len(gaps):
+        return
+    lost = int(np.sum(np.rint(spacing[gaps] / usual) - 1))
+    worst = gaps[np.argmax(spacing[gaps])]
+    length = spacing[worst] / NS_PER_S
+    is_torque = topic.name == mechanism(raw.mechanism).torque.name
+    unknown = False
+    for k in gaps[spacing[gaps] > LONG_GAP_S * NS_PER_S]:
+        for values in topic.values.values():
+            unknown |= is_torque and values[order][k] != values[order][k + 1]
+    share = lost / (len(stamp) + lost)
+    # A sensor that reports only now and then is read as it comes; one that stops is not.
+    useless = share > LOST_SHARE and length > LONG_GAP_S and not (is_torque and not unknown)
+    yield Finding(
+        'gap', 'error' if unknown or useless else 'warning', topic.name,
+        f'{len(gaps)} gap(s), about {lost} sample(s) lost ({share:.1%}); the longest '
+        f'{1e3 * length:.1f} ms instead of {usual / 1e6:.3g} ms'
+        + ('; the torque in between is not known' if unknown else ''),
+        _seconds(stamp[worst], origin), _seconds(stamp[worst + 1], origin),
+        int(order[worst]), length, GAP * usual / NS_PER_S)
+
+
+def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]:
+    """Rates that differ from the nominal one, or change midway."""
+    stamp = np.unique(topic.stamp_ns)
+    spacing = np.diff(stamp) / NS_PER_S
+    if len(spacing) < 4:
+        return
+    # Without the gaps, which have a finding of their own; the mean knows jitter, the median not.
+    regular = spacing[spacing <= GAP * np.median(spacing)]
+    rate = 1.0 / float(np.mean(regular))
+    change = _change_of_rate(spacing)
+    if change is not None:
+        k, before, after = change
+        yield Finding(
+            'rate_change', 'warning', topic.name,
+            f'the rate changes midway, from {before:.4g} Hz to {after:.4g} Hz',
+            _seconds(stamp[k], origin), _seconds(stamp[-1], origin), k, after, before)
+    known = isinstance(nominal_hz, int | float) and nominal_hz > 0
+    if known and abs(rate / nominal_hz - 1.0) > RATE_TOLERANCE:
+        yield Finding('rate', 'warning', topic.name,
+                      f'{rate:.4g} Hz instead of the nominal {nominal_hz:.4g} Hz',
+                      value=rate, allowed=nominal_hz)
+
+
+def _change_of_rate(spacing: np.ndarray) -> tuple[int, float, float] | None:
+    """Place of the lasting change of the rate, and the rates before and after, if there is one."""
+    blocks = len(spacing) // RATE_BLOCK
+    if blocks < 6:
+        return None
+    trimmed = spacing[: blocks * RATE_BLOCK].reshape(blocks, RATE_BLOCK)
+    levels = np.log(np.median(trimmed, axis=1))
+    total = np.cumsum(levels)
+    left = np.arange(3, blocks - 2)
+    contrast = total[left - 1] / left - (total[-1] - total[left - 1]) / (blocks - left)
+    weight = np.sqrt(left * (blocks - left) / blocks)
+    cut = int(left[np.argmax(np.abs(contrast) * weight)])
+    before, after = np.median(levels[:cut]), np.median(levels[cut:])
+    spread = np.median(np.abs(np.concatenate([levels[:cut] - before, levels[cut:] - after])))
+    if abs(after - before) < np.log1p(RATE_CHANGE) or abs(after - before) < 6.0 * spread:
+        return None
+    return cut * RATE_BLOCK, float(np.exp(-before)), float(np.exp(-after))
