@@ -80,12 +80,7 @@ class DeclaredSettings:
         hints = typing.get_type_hints(kind)
         given = {}
         for field in dataclasses.fields(kind):
-            type_ = PARAMETER_TYPES[hints[field.name]]
-            default = list(field.default) if isinstance(field.default, tuple) else field.default
-            declared = node.declare_parameter(
-                field.name, Parameter(field.name, type_, default).value, _descriptor(field, type_)
-            )
-            given[field.name] = declared.value
+            given[field.name] = _declare(node, field, PARAMETER_TYPES[hints[field.name]])
         self.values = kind(**given)
         self._at_work = at_work
         node.add_on_set_parameters_callback(self._judge)
@@ -110,6 +105,20 @@ class DeclaredSettings:
 
     def _adopt(self, parameters: list[Parameter]) -> None:
         self.values = dataclasses.replace(self.values, **self._mine(parameters))
+
+
+def _declare(node: Node, field: dataclasses.Field, type_: Parameter.Type) -> Any:
+    """Declare one parameter; its value, which is the default unless one was given."""
+    name, default, descriptor = field.name, field.default, _descriptor(field, type_)
+    if default != ():
+        value = list(default) if isinstance(default, tuple) else default
+        return node.declare_parameter(name, value, descriptor).value
+    # rclpy takes an empty list for bytes, unless it is told the type apart from the value.
+    declared = node.declare_parameter(name, type_, descriptor)
+    if declared.type_ == Parameter.Type.NOT_SET:
+        node.set_parameters([Parameter(name, type_, [])])
+        return []
+    return declared.value
 
 
 def _descriptor(field: dataclasses.Field, type_: Parameter.Type) -> ParameterDescriptor:

@@ -158,7 +158,8 @@ def playback(path: Path) -> Signal:
     Raises:
         ValueError: naming file, line and what is wrong.
     """
-    rows = []
+    rows: list[tuple[float, float]] = []
+    titles = 0
     try:
         with path.open(newline='', encoding='utf-8') as file:
             for number, row in enumerate(csv.reader(file), start=1):
@@ -167,7 +168,8 @@ def playback(path: Path) -> Signal:
                 try:
                     rows.append((float(row[0]), float(row[1])))
                 except (ValueError, IndexError):
-                    if number > 1:
+                    titles += 1
+                    if rows or titles > 1:
                         raise ValueError(
                             f'{path}:{number}: expected time in s, torque in N m; got {row}'
                         ) from None

@@ -4,6 +4,7 @@ While it runs, a recording is a directory that holds a journal (journal.py). `cl
 into an ordinary rosbag2 directory; `recover.py` does the same for one that was never closed.
 """
 
+import shutil
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -186,7 +187,11 @@ class Recording:
         return min(stamps, default=0)
 
     def close(self) -> Recovered:
-        """End the recording and make it an ordinary bag."""
+        """End the recording and make it an ordinary bag; nothing recorded leaves nothing."""
+        if self.messages == 0 and not self._waiting:
+            self._journal.close()
+            shutil.rmtree(self.path)
+            return Recovered(self.path, 0, '')
         for topic, data in self._waiting:
             recorded = self._topics[topic]
             self._journal.write(recorded.channel, recorded.count, 0, 0, data, 0.0)

@@ -102,15 +102,16 @@ class RecorderNode(Node):
 
     def close(self) -> None:
         """Make the recording an ordinary bag."""
-        if self.recording.messages == 0:
-            self.get_logger().warning('nothing was recorded')
         try:
             result = self.recording.close()
         except (ValueError, OSError) as error:
             self.get_logger().error(f'{self.recording.path}: {error}')
             self.exit_status = 1
             return
-        self.get_logger().info(f'{result.messages} messages in {result.path}')
+        if result.messages == 0:
+            self.get_logger().warning('nothing was recorded, no bag is left')
+        else:
+            self.get_logger().info(f'{result.messages} messages in {result.path}')
 
 
 def message_class(msgtype: str) -> type:

@@ -1,0 +1,1 @@
+"""Whole-robot configurations, experiments and the demonstration."""

@@ -1,0 +1,201 @@
+"""Carry out an experiment on the live system: `ros2 run cg_bringup experiment NAME --out DIR`.
+
+Starts the simulated hardware, the excitation and the recorder as processes of their own, waits
+for the machine to finish, shuts the others down, checks the bag and prints its path.
+"""
+
+import argparse
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from cg_bringup.experiments import (
+    MODES,
+    NODE_MODULES,
+    ExperimentError,
+    Run,
+    experiment_names,
+    load_experiment,
+    node_parameters,
+    parameter_file_text,
+)
+
+RATE_HZ = 500.0
+START_UP = 60.0  # s that processes and discovery may take on a busy machine
+SLOWEST = 8.0  # s that a lock-step run may take per simulated s
+CLOSING = 120.0  # s that the recorder may take to close its bag
+POLL = 0.02  # s
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What an experiment left.
+
+    Attributes:
+        path: The bag directory.
+        counts: Topic -> number of messages.
+        seconds: How long the run took.
+    """
+
+    path: Path
+    counts: dict[str, int]
+    seconds: float
+
+
+def run_experiment(run: Run, on_wait: Callable[[], None] = lambda: None) -> Recorded:
+    """Carry out an experiment in processes of their own.
+
+    Args:
+        run: What to do.
+        on_wait: Called some times a second while waiting.
+
+    Raises:
+        ExperimentError: A node failed or the bag is not what it should be; the message ends
+            with what the nodes said.
+    """
+    if run.bag.exists():
+        raise ExperimentError(f'{run.bag} exists already; recordings are never overwritten')
+    run.bag.parent.mkdir(parents=True, exist_ok=True)
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix='cg_experiment_') as directory:
+        parameters = Path(directory) / 'parameters.yaml'
+        parameters.write_text(parameter_file_text(node_parameters(run)), encoding='utf-8')
+        log = Path(directory) / 'log'
+        try:
+            with log.open('w') as output, _nodes(parameters, output) as nodes:
+                _wait_for_machine(nodes, run, on_wait)
+                _end(nodes)
+            counts = check_counts(run)
+        except ExperimentError as error:
+            said = log.read_text(encoding='utf-8', errors='replace').strip()
+            raise ExperimentError(f'{run.experiment.name}: {error}\n{said}') from None
+    return Recorded(run.bag, counts, time.monotonic() - start)
+
+
+@contextlib.contextmanager
+def _nodes(parameters: Path, output) -> Iterator[dict[str, subprocess.Popen]]:
+    nodes: dict[str, subprocess.Popen] = {}
+    try:
+        for name, (package, module) in NODE_MODULES.items():
+            nodes[name] = subprocess.Popen(
+                [sys.executable, '-m', f'{package}.{module}']
+                + ['--ros-args', '--params-file', str(parameters)],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                # Ctrl-C reaches this process alone, which then ends its nodes in order.
+                start_new_session=True,
+            )
+        yield nodes
+    finally:
+        for node in nodes.values():
+            if node.poll() is None:
+                node.send_signal(signal.SIGINT)
+        for node in nodes.values():
+            try:
+                node.wait(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                node.kill()
+                node.wait()
+
+
+def _wait_for_machine(
+    nodes: dict[str, subprocess.Popen], run: Run, on_wait: Callable[[], None]
+) -> None:
+    pace = SLOWEST if run.mode == 'lockstep' else 1.0
+    deadline = time.monotonic() + START_UP + pace * run.length
+    machine = nodes['simulation_node']
+    while machine.poll() is None:
+        on_wait()
+        for name, node in nodes.items():
+            if node is not machine and node.poll() is not None:
+                raise ExperimentError(f'{name} ended early with status {node.returncode}')
+        if time.monotonic() > deadline:
+            raise ExperimentError(f'not finished {START_UP + pace * run.length:.0f} s after start')
+        time.sleep(POLL)
+    if machine.returncode != 0:
+        raise ExperimentError(f'the machine gave up with status {machine.returncode}')
+
+
+def _end(nodes: dict[str, subprocess.Popen]) -> None:
+    for name in ('excitation', 'recorder'):
+        nodes[name].send_signal(signal.SIGINT)
+    for name in ('excitation', 'recorder'):
+        try:
+            status = nodes[name].wait(timeout=CLOSING)
+        except subprocess.TimeoutExpired:
+            raise ExperimentError(f'{name} does not end') from None
+        if status != 0:
+            raise ExperimentError(f'{name} ended with status {status}')
+
+
+def check_counts(run: Run) -> dict[str, int]:
+    """Messages per topic of the finished bag.
+
+    Raises:
+        ExperimentError: There is no complete bag, or samples are missing in it.
+    """
+    metadata = run.bag / 'metadata.yaml'
+    if not metadata.is_file():
+        raise ExperimentError(f'{run.bag} was not closed; `recover` makes a bag of it')
+    tree = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
+    counts = {
+        topic['topic_metadata']['name']: topic['message_count']
+        for topic in tree['topics_with_message_count']
+    }
+    expected = round(run.length * RATE_HZ)
+    sparing = {'/torque_command': 0 if run.mode == 'real_time' else expected, '/experiment': 1}
+    for topic in ('/experiment', '/applied_torque', *counts):
+        needed = sparing.get(topic, expected)
+        if counts.get(topic, 0) < needed:
+            raise ExperimentError(
+                f'{run.bag}: {counts.get(topic, 0)} messages of {topic}, expected {needed}'
+            )
+    return counts
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_bringup experiment`."""
+    parser = argparse.ArgumentParser(prog='experiment', description=__doc__)
+    parser.add_argument('name', help=f'one of {", ".join(experiment_names())}; or a .yaml file')
+    parser.add_argument('--model', type=Path, help='model file of the machine [nominal]')
+    parser.add_argument('--seed', type=int, default=1, help='of noise and excitation [1]')
+    parser.add_argument(
+        '--out', type=Path, default=Path('bags'), help='directory that gets the bag [bags]'
+    )
+    parser.add_argument('--mode', choices=MODES, default='lockstep', help='[lockstep]')
+    parser.add_argument('--duration', type=float, help='in s [that of the experiment]')
+    options = parser.parse_args(args)
+    try:
+        experiment = load_experiment(options.name)
+        run = Run(
+            experiment,
+            bag=options.out / f'{experiment.name}_seed{options.seed}',
+            model_file=options.model,
+            seed=options.seed,
+            mode=options.mode,
+            duration=options.duration,
+        )
+        recorded = run_experiment(run)
+    except ValueError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return 130
+    messages = sum(recorded.counts.values())
+    print(f'{messages} messages, {run.length:g} s recorded in {recorded.seconds:.1f} s')
+    print(recorded.path)
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
