@@ -1,0 +1,156 @@
+"""The demonstration: a machine with a secret, five experiments, one diagnosis.
+
+`ros2 run cg_bringup demo` draws an effect and other lumps, hides them in the simulated hardware,
+carries out experiments on the live system, hands the bags and the nominal model, and nothing
+else, to the analysis in a process of its own, prints its verdict, and only then what was hidden.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cg_bringup.experiment import run_experiment
+from cg_bringup.experiments import NOMINAL_MODEL, ExperimentError, Run, load_experiment
+from cg_bringup.hidden import Hidden, hide
+from cg_description.paths import model_path
+from cg_dynamics.domains import own_domain
+from cg_dynamics.model import Model
+
+# The last repeats the first with another excitation.
+PROGRAMME = (
+    'spring_stabilised_inner',
+    'spring_stabilised_outer',
+    'swing_inner_fixed',
+    'swing_outer_fixed',
+    'spring_stabilised_inner',
+)
+DURATION = 12.0  # s
+
+
+def record_programme(
+    console: Console, machine: Path, nominal: Path, out: Path, seed: int, duration: float
+) -> list[Path]:
+    """Carry out the experiments; return the bags."""
+    bags = []
+    with own_domain() as domain:
+        console.print(f'[bold]Recording[/] {len(PROGRAMME)} x {duration:g} s (ROS domain {domain})')
+        for index, name in enumerate(PROGRAMME, start=1):
+            experiment = load_experiment(name)
+            bag = out / f'{index}_{name}'
+            run = Run(
+                experiment,
+                bag=bag,
+                model_file=machine,
+                note_model_file=nominal,
+                seed=100 * seed + index,
+                duration=duration,
+            )
+            with console.status(f'{index}/{len(PROGRAMME)} {name}'):
+                recorded = run_experiment(run)
+            messages = sum(recorded.counts.values())
+            console.print(f'  {bag.name}: {messages} messages in {recorded.seconds:.1f} s')
+            bags.append(bag)
+    return bags
+
+
+def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> dict[str, Any]:
+    """Run the analysis in a process of its own; return what it found.
+
+    Raises:
+        ExperimentError: It failed; the message ends with what it said.
+    """
+    command = [sys.executable, '-m', 'cg_sysid.cli', 'diagnose']
+    command += ['--model', str(nominal), '--out', str(out), *map(str, bags)]
+    start = time.monotonic()
+    with console.status('diagnosing'):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = out / 'diagnosis.json'
+    if not result.is_file():
+        raise ExperimentError(
+            f'the analysis ended with status {done.returncode}\n{done.stdout}{done.stderr}'
+        )
+    console.print(f'[bold]Diagnosis[/] from bags and nominal model alone, '
+                  f'{time.monotonic() - start:.1f} s')
+    if done.stdout.strip():
+        console.print(done.stdout.strip(), markup=False, highlight=False)
+    return json.loads(result.read_text(encoding='utf-8'))
+
+
+def reveal(console: Console, nominal: Model, hidden: Hidden) -> None:
+    """Say what had been hidden."""
+    units = {p.name: p.unit for p in hidden.model.effect(hidden.effect).parameters}
+    values = ', '.join(
+        f'{name} {value:.4g} {units[name] if units[name] != "1" else ""}'.rstrip()
+        for name, value in hidden.values.items()
+    )
+    console.print(f'\n[bold]What had been hidden:[/] {hidden.effect} ({values})')
+    table = Table('parameter', 'nominal', 'true', 'off by', title='and these numbers were off')
+    for name, factor in hidden.factors.items():
+        value = nominal.values[name]
+        table.add_row(name, f'{value:.4g}', f'{value * factor:.4g}', f'{100 * (factor - 1):+.0f} %')
+    console.print(table)
+
+
+def run_demo(
+    effect: str | None, seed: int, out: Path, duration: float, console: Console
+) -> dict[str, Any]:
+    """The whole demonstration; returns the diagnosis.
+
+    Raises:
+        ValueError: Something did not go through; the message says what.
+    """
+    if out.exists() and any(out.iterdir()):
+        raise ExperimentError(f'{out} is not empty; name another directory with --out')
+    start = time.monotonic()
+    nominal_path = model_path(NOMINAL_MODEL)
+    nominal = Model.load(nominal_path)
+    hidden = hide(nominal, effect, seed)
+    # Out of the way of the analysis until it has spoken.
+    with tempfile.TemporaryDirectory(prefix='cg_machine_') as directory:
+        machine = Path(directory) / 'machine.yaml'
+        hidden.model.save(machine)
+        bags = record_programme(console, machine, nominal_path, out / 'bags', seed, duration)
+        found = diagnose(console, nominal_path, bags, out)
+        shutil.copy(machine, out / 'hidden_machine.yaml')
+    reveal(console, nominal, hidden)
+    console.print(f'\nReport: {out / "report.html"}\nModel:  {out / "model.yaml"}')
+    console.print(f'Bags:   {out / "bags"}   ({time.monotonic() - start:.0f} s in all)')
+    return found
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_bringup demo`."""
+    parser = argparse.ArgumentParser(prog='demo', description=__doc__)
+    parser.add_argument('--effect', help='effect to hide [drawn from the seed]')
+    parser.add_argument('--seed', type=int, help='of everything that is drawn [from the clock]')
+    parser.add_argument('--out', type=Path, help='directory for bags and report [demo_<seed>]')
+    parser.add_argument(
+        '--duration', type=float, default=DURATION, help=f'of each record in s [{DURATION:g}]'
+    )
+    options = parser.parse_args(args)
+    seed = time.time_ns() % 10000 if options.seed is None else options.seed
+    out = options.out or Path(f'demo_{seed}')
+    console = Console(highlight=False)
+    console.print(f'[bold]Demonstration[/], seed {seed}: a machine with a secret')
+    try:
+        run_demo(options.effect, seed, out, options.duration, console)
+    except (ValueError, RuntimeError, OSError) as error:
+        console.print(f'error: {error}', markup=False, style='red')
+        return 1
+    except KeyboardInterrupt:
+        console.print('interrupted')
+        return 130
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

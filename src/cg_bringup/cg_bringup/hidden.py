@@ -1,0 +1,103 @@
+"""A machine that is not what its model says: an effect nobody told the analysis, and other lumps.
+
+Drawn from a seed, so that every demonstration can be repeated.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cg_bringup.experiments import ExperimentError, experiments_directory
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.errors import ModelError
+from cg_dynamics.model import Model
+
+DRAWS = 200  # attempts to perturb the lumps such that real bodies can have them
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What the simulated hardware is, and the analysis does not know.
+
+    Attributes:
+        model: The machine.
+        effect: Name of the hidden effect.
+        values: Its parameters, in the units of the effect library.
+        factors: Parameter of the nominal model -> true value over nominal value.
+    """
+
+    model: Model
+    effect: str
+    values: dict[str, float]
+    factors: dict[str, float]
+
+
+def hidden_effects_file() -> Path:
+    """The file of effects and magnitudes to draw from."""
+    return experiments_directory().parent / 'hidden_effects.yaml'
+
+
+def hideable_effects(nominal: Model) -> list[str]:
+    """Effects of the file that the library knows and the nominal model does not have yet."""
+    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
+    present = {effect.label for effect in nominal.effects}
+    return [name for name in table if name in LIBRARY and name not in present]
+
+
+def hide(nominal: Model, effect: str | None, seed: int) -> Hidden:
+    """Make the hidden machine.
+
+    Args:
+        nominal: What the analysis will believe in.
+        effect: Effect to hide; None to draw one.
+        seed: Of everything that is drawn.
+
+    Raises:
+        ExperimentError: There is no such effect to hide.
+    """
+    rng = np.random.default_rng(seed)
+    names = hideable_effects(nominal)
+    drawn = str(rng.choice(names))
+    name = drawn if effect is None else effect
+    if name not in names:
+        raise ExperimentError(f'no effect {name!r} to hide; there are: {", ".join(names)}')
+    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
+    values = draw_values(table[name], rng)
+    model, factors = perturb(nominal, rng)
+    return Hidden(model.with_effect(name, **values), name, values, factors)
+
+
+def draw_values(ranges: dict[str, Any], rng: np.random.Generator) -> dict[str, float]:
+    """Values from their ranges, log-uniformly, with a random sign where one is allowed."""
+    signed = ranges.get('signed', ())
+    values = {}
+    for name, bounds in ranges.items():
+        if name == 'signed':
+            continue
+        value = float(np.exp(rng.uniform(*np.log(bounds))))
+        values[name] = value * float(rng.choice((-1.0, 1.0))) if name in signed else value
+    return values
+
+
+def perturb(nominal: Model, rng: np.random.Generator) -> tuple[Model, dict[str, float]]:
+    """The model with every believed number off by 10 to 20 %, either way.
+
+    Returns:
+        The model, and parameter -> factor.
+    """
+    free = [name for name, q in nominal.quantities.items() if q.tolerance and not q.fixed]
+    for _ in range(DRAWS):
+        shares = rng.uniform(0.1, 0.2, len(free)) * rng.choice((-1.0, 1.0), len(free))
+        factors = {name: 1.0 + float(share) for name, share in zip(free, shares, strict=True)}
+        model = nominal.with_values(
+            {name: nominal.values[name] * factor for name, factor in factors.items()}
+        )
+        try:
+            model.require_consistency()
+        except ModelError:
+            continue
+        return model, factors
+    raise ExperimentError(f'no consistent perturbation of {nominal.name} in {DRAWS} draws')
