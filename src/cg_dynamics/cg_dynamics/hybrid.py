@@ -1,0 +1,299 @@
+"""Hybrid simulation: stance phases joined by impacts, each located in time.
+
+The swing foot, relative to the stance foot, is at r = l (d(q_st) - d(q_sw)); over ground that
+falls by `slope` ahead its height is
+
+    phi(q) = r_z + r_x tan(slope)                                                (GUARD)
+
+An impact is where phi falls through zero while the foot is ahead of the stance foot. The legs are
+equally long, so phi also touches zero when they pass each other: there the real robot has its
+feet retracted, and the guard must not fire. It cannot: it asks for r_x > minimum_step.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import brentq
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import CompiledModel, compile_model
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.impact import Impact, impact, other
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES, Setup
+
+# Instants are found to this many seconds: far below what a step of integration errs.
+INSTANT = 1e-12
+
+Command = Callable[[float, str, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """How to walk.
+
+    Attributes:
+        slope: Fall of the ground ahead in rad, in the frame of the angles. A model with the effect
+            `ground_slope` has its angles from the ground, so it wants 0 here.
+        step: Runge-Kutta step in s.
+        sample_time: Time from one command to the next in s; commands are held.
+        minimum_step: Distance in m that the swing foot must be ahead for an impact.
+        clearance: Retraction of the swing foot in m. Where the extended foot would be deeper in
+            the ground, the real one scuffs. Infinite: feet pass through the ground.
+        stop_on_scuff: End at the first scuff.
+        fall_angle: Lean of the stance leg in rad that counts as a fall.
+        largest_steps: End after so many impacts.
+    """
+
+    slope: float = 0.0
+    step: float = 0.001
+    sample_time: float = 0.002
+    minimum_step: float = 0.02
+    clearance: float = math.inf
+    stop_on_scuff: bool = False
+    fall_angle: float = 1.0
+    largest_steps: int = 1000
+
+    def __post_init__(self):
+        for name in ('step', 'sample_time', 'clearance', 'fall_angle'):
+            if not getattr(self, name) > 0:
+                raise ValueError(f'{name} must be positive, got {getattr(self, name)}')
+        if not abs(self.slope) < math.pi / 2:
+            raise ValueError(f'slope must be within a quarter turn, got {self.slope} rad')
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened at one instant.
+
+    Attributes:
+        kind: 'impact', 'scuff' or 'fall'.
+        time: In s.
+        stance: Stance leg until then.
+        x: State until then.
+        impact: What the impact did; None for other kinds.
+        step_length: Distance in m from the old to the new stance foot along the ground; 0 for
+            other kinds.
+    """
+
+    kind: str
+    time: float
+    stance: str
+    x: np.ndarray
+    impact: Impact | None = None
+    step_length: float = 0.0
+
+
+@dataclass(frozen=True)
+class Arc:
+    """One stance phase.
+
+    Attributes:
+        stance: The leg pair that stands.
+        time: Instants in s, first and last included, shape (n,).
+        states: States there, shape (n, nx).
+        inputs: Torque that acts from each instant on, shape (n, nu), N m.
+    """
+
+    stance: str
+    time: np.ndarray
+    states: np.ndarray
+    inputs: np.ndarray
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A hybrid motion.
+
+    Attributes:
+        arcs: Stance phases, in order.
+        events: What happened, in order.
+        outcome: Why it ended: 'time', 'steps', 'fall' or 'scuff'.
+    """
+
+    arcs: tuple[Arc, ...]
+    events: tuple[Event, ...]
+    outcome: str
+
+    @property
+    def impacts(self) -> tuple[Event, ...]:
+        """The impacts among the events."""
+        return tuple(event for event in self.events if event.kind == 'impact')
+
+    @property
+    def stance(self) -> str:
+        """Stance leg at the end."""
+        return self.arcs[-1].stance
+
+    @property
+    def state(self) -> np.ndarray:
+        """State at the end, shape (nx,)."""
+        return self.arcs[-1].states[-1]
+
+    @property
+    def time(self) -> float:
+        """End in s."""
+        return float(self.arcs[-1].time[-1])
+
+
+def swing_foot(q, stance: str, leg_length: float) -> tuple[float, float]:
+    """Position (x, z) in m of the swing foot relative to the stance foot."""
+    standing, swinging = (q[0], q[1]) if stance == 'inner' else (q[1], q[0])
+    return (
+        leg_length * (math.sin(standing) - math.sin(swinging)),
+        leg_length * (math.cos(standing) - math.cos(swinging)),
+    )
+
+
+@dataclass
+class _Leg:
+    """A stance phase while it is being simulated."""
+
+    stance: str
+    compiled: CompiledModel
+    time: list[float] = field(default_factory=list)
+    states: list[np.ndarray] = field(default_factory=list)
+    inputs: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
+        self.time.append(t)
+        self.states.append(x)
+        self.inputs.append(u)
+
+    def arc(self) -> Arc:
+        return Arc(
+            self.stance, np.array(self.time), np.array(self.states), np.array(self.inputs)
+        )
+
+
+def walk(
+    model: Model,
+    stance: str,
+    x0: np.ndarray,
+    duration: float,
+    command: Command | None = None,
+    options: WalkOptions | None = None,
+) -> Walk:
+    """Simulate until time is over, the robot falls, or enough steps are done.
+
+    Args:
+        model: A compass gait.
+        stance: Stance leg at the start, 'inner' or 'outer'.
+        x0: State at the start: (q_inner, q_outer) and rates, extra states optional.
+        duration: In s.
+        command: (time, stance, x) -> torque (nu,), asked every `sample_time` and held; it acts
+            late by the model's input delay. None: no torque.
+        options: How to walk.
+
+    Raises:
+        SimulationError: if the state runs away.
+    """
+    options = options or WalkOptions()
+    return _Walker(model, options, command).run(stance, np.asarray(x0, float), duration)
+
+
+class _Walker:
+    def __init__(self, model: Model, options: WalkOptions, command: Command | None):
+        self.model, self.options = model, options
+        self.command = command
+        self.compiled = {s: compile_model(model, Setup(stance=s)) for s in STANCES}
+        self.p = parameter_vector(model, Setup())
+        self.leg_length = model.values['leg_length']
+        self.tangent = math.tan(options.slope)
+        self.step = min(options.step, *(c.largest_step for c in self.compiled.values()))
+        self.delay = self.compiled['inner'].delays(self.p)[0]
+        self.events: list[Event] = []
+        self.scuffed = False
+
+    def run(self, stance: str, x: np.ndarray, duration: float) -> Walk:
+        compiled = self.compiled[stance]
+        u = np.zeros(compiled.nu)
+        if len(x) != compiled.nx:
+            x = compiled.initial_state(x[:4], u, self.p)
+        leg, arcs, outcome = _Leg(stance, compiled), [], 'time'
+        # Torques on their way: (instant at which it acts, torque).
+        latches: list[tuple[float, np.ndarray]] = []
+        t, tick = 0.0, 0
+        while t < duration - INSTANT and outcome == 'time':
+            if self.command is not None:
+                wanted = np.array(self.command(t, leg.stance, x.copy()), float).reshape(u.shape)
+                latches.append((t + self.delay, wanted))
+            tick += 1
+            end = min(tick * self.options.sample_time, duration)
+            while t < end - INSTANT and outcome == 'time':
+                while latches and latches[0][0] <= t + INSTANT:
+                    u = latches.pop(0)[1]
+                until = min(end, latches[0][0]) if latches else end
+                steps = max(1, math.ceil((until - t) / self.step - 1e-9))
+                t, x, event = self._one_step(leg, t, x, u, (until - t) / steps)
+                if event is None:
+                    continue
+                self.events.append(event)
+                outcome = self._outcome(event)
+                if event.kind == 'impact':
+                    leg.add(t, x, u)
+                    arcs.append(leg.arc())
+                    leg = _Leg(event.impact.stance, self.compiled[event.impact.stance])
+                    x, self.scuffed = event.impact.x_plus.copy(), False
+        leg.add(t, x, u)
+        return Walk((*arcs, leg.arc()), tuple(self.events), outcome)
+
+    def _outcome(self, event: Event) -> str:
+        if event.kind == 'fall' or (event.kind == 'scuff' and self.options.stop_on_scuff):
+            return event.kind
+        impacts = sum(e.kind == 'impact' for e in self.events)
+        return 'steps' if impacts >= self.options.largest_steps else 'time'
+
+    def _one_step(self, leg: _Leg, t: float, x: np.ndarray, u: np.ndarray, h: float):
+        """One Runge-Kutta step, cut short where something happens."""
+        leg.add(t, x, u)
+
+        def after(part: float) -> np.ndarray:
+            y = x.copy()
+            leg.compiled.advance(y, u, self.p, part, 1)
+            return y
+
+        y = after(h)
+        if not (np.abs(y) < 1e6).all():
+            raise SimulationError(f'the state runs away at {t + h:.3f} s', t + h)
+        found = []
+        for kind, value in self._guards(leg.stance):
+            if value(x) > 0 >= value(y):
+                part = brentq(lambda s, value=value: value(after(s)), 0.0, h, xtol=INSTANT)
+                found.append((part, kind))
+        for part, kind in sorted(found):
+            z = after(part)
+            reach, _ = swing_foot(z, leg.stance, self.leg_length)
+            if kind == 'impact':
+                if reach <= self.options.minimum_step:
+                    continue
+                length = reach / math.cos(self.options.slope)
+                event = Event(
+                    kind, t + part, leg.stance, z, impact(self.model, leg.stance, z), length
+                )
+            elif kind == 'scuff':
+                if self.scuffed:
+                    continue
+                self.scuffed = True
+                event = Event(kind, t + part, leg.stance, z)
+            else:
+                event = Event(kind, t + part, leg.stance, z)
+            return t + part, z, event
+        return t + h, y, None
+
+    def _guards(self, stance: str):
+        standing = STANCES.index(stance)
+
+        def height(x):
+            reach, rise = swing_foot(x, stance, self.leg_length)
+            return rise + reach * self.tangent
+
+        yield 'impact', height
+        if math.isfinite(self.options.clearance):
+            yield 'scuff', lambda x: height(x) + self.options.clearance
+        yield 'fall', lambda x: self.options.fall_angle - abs(x[standing])
+
+
+__all__ = ['Arc', 'Command', 'Event', 'Walk', 'WalkOptions', 'other', 'swing_foot', 'walk']

@@ -1,0 +1,73 @@
+"""Linearisation of an assembled model at any state: Eq. 4.8 and 4.9, theory.md, (LIN).
+
+    dx/dt = f(x0, u0) + A (x - x0) + B (u - u0),   y = h(x0, u0) + C (x - x0) + D (u - u0)
+
+A and B are derivatives of the whole right-hand side, so they hold away from equilibria too, where
+the form printed as Eq. 4.8 (which drops the derivatives of H^-1 and C) does not.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import CompiledModel, compile_model
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A model near (x0, u0).
+
+    Attributes:
+        A: df/dx in 1/s and the units of x, shape (nx, nx).
+        B: df/du, shape (nx, nu).
+        C: dh/dx, shape (ny, nx).
+        D: dh/du, shape (ny, nu).
+        rates: f(x0, u0), zero at an equilibrium, shape (nx,).
+        outputs: h(x0, u0), shape (ny,).
+        state_names: Names of x.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    rates: np.ndarray
+    outputs: np.ndarray
+    state_names: tuple[str, ...]
+
+
+@functools.cache
+def jacobians(compiled: CompiledModel) -> ca.Function:
+    """x, u, p -> A, B, C, D, rates, outputs. `Function.map` makes it one call per trajectory."""
+    e = compiled.equations
+    expressions = [
+        ca.jacobian(e.rates, e.x),
+        ca.jacobian(e.rates, e.u),
+        ca.jacobian(e.outputs, e.x),
+        ca.jacobian(e.outputs, e.u),
+        e.rates,
+        e.outputs,
+    ]
+    names = ['A', 'B', 'C', 'D', 'rates', 'outputs']
+    dense = list(ca.cse([ca.densify(expression) for expression in expressions]))
+    return ca.Function('jacobians', [e.x, e.u, e.p], dense, ['x', 'u', 'p'], names)
+
+
+def linearise(model: Model, setup: Setup, x0: np.ndarray, u0: np.ndarray) -> Linearisation:
+    """(LIN) of a model in a set-up. Delays are left out: they are not part of f.
+
+    Args:
+        model: The model.
+        setup: The set-up.
+        x0: State, shape (nx,).
+        u0: Inputs, shape (nu,), N m.
+    """
+    compiled = compile_model(model, setup)
+    results = jacobians(compiled)(x0, u0, parameter_vector(model, setup))
+    A, B, C, D, rates, outputs = (np.asarray(result) for result in results)
+    return Linearisation(A, B, C, D, rates.ravel(), outputs.ravel(), compiled.state_names)
