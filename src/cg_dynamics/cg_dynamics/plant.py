@@ -165,12 +165,14 @@ class Plant:
         # The state at an earlier instant: cubic through its two neighbours, rates from differences
         # of fine steps are not needed at sample times of milliseconds.
         times = [time for time, _ in self._past]
-        i = min(max(bisect.bisect_right(times, t) - 1, 0), len(times) - 2) if len(times) > 1 else 0
+        u = self._latches[0][1]
         if len(times) == 1 or t <= times[0]:
-            return self._past[0][1]
+            # The machine did not come into being at the first sample: it was moving on before.
+            t0, x0 = self._past[0]
+            return x0 + (t - t0) * np.asarray(self._compiled.f(x0, u, self._p)).ravel()
+        i = min(max(bisect.bisect_right(times, t) - 1, 0), len(times) - 2)
         (t0, x0), (t1, x1) = self._past[i], self._past[i + 1]
         h, s = t1 - t0, (t - t0) / (t1 - t0)
-        u = self._latches[0][1]
         d0, d1 = (np.asarray(self._compiled.f(x, u, self._p)).ravel() for x in (x0, x1))
         r = 1 - s
         return (

@@ -66,10 +66,6 @@ int cgm_simulate(int n, const double *dt, double largest, const double *u, const
     return n;
 }
 
-/* Outputs (n, NY) of given states, late by delay[NY] seconds on the time axis t. */
-static void interpolate(int rows, int width, int k, double t, const double *time, const double *X,
-                        const double *dX, double *out);
-
 static int before(int k, double t, const double *time)
 {
     while (k > 0 && time[k] > t) k--;
@@ -79,9 +75,10 @@ static int before(int k, double t, const double *time)
 static void interpolate(int rows, int width, int k, double t, const double *time, const double *X,
                         const double *dX, double *out)
 {
-    /* Cubic Hermite between rows k and k+1; held at the ends. */
+    /* Cubic Hermite between rows k and k+1; straight on before the first and after the last. */
     if (k + 1 >= rows || t <= time[0]) {
-        memcpy(out, X + k * width, width * sizeof(double));
+        for (int i = 0; i < width; i++)
+            out[i] = X[(size_t)k * width + i] + (t - time[k]) * dX[(size_t)k * width + i];
         return;
     }
     double h = time[k + 1] - time[k], s = (t - time[k]) / h, r = 1 - s;
@@ -91,6 +88,7 @@ static void interpolate(int rows, int width, int k, double t, const double *time
     for (int i = 0; i < width; i++) out[i] = a0 * x0[i] + a1 * x1[i] + b0 * d0[i] + b1 * d1[i];
 }
 
+/* Outputs (n, NY) of given states, each late by delay[NY] seconds. */
 void cgm_outputs(int n, const double *time, const double *u, const double *p, const double *X,
                  const double *delay, double *Y)
 {
@@ -108,11 +106,7 @@ void cgm_outputs(int n, const double *time, const double *u, const double *p, co
             int b = before(k, t, time);
             rates(X + b * NX, u + b * NU, p, d);
             if (b + 1 < n) rates(X + (b + 1) * NX, u + (b + 1) * NU, p, d + NX);
-            const double pair_time[2] = {time[b], b + 1 < n ? time[b + 1] : time[b] + 1};
-            if (b + 1 < n && t > time[0])
-                interpolate(2, NX, 0, t, pair_time, X + b * NX, d, x);
-            else
-                memcpy(x, X + b * NX, NX * sizeof(double));
+            interpolate(b + 1 < n ? 2 : 1, NX, 0, t, time + b, X + b * NX, d, x);
             const double *late_arg[3] = {x, u + b * NU, p};
             cgm_h(late_arg, res, 0, w, 0);
             Y[k * NY + j] = y[j];
@@ -227,7 +221,7 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
             output_sensitive(late_x, late_S, u + b * NU, p, nc, column, late_y, late_J);
             y[j] = late_y[j];
             memcpy(J + j * nc, late_J + j * nc, nc * sizeof(double));
-            if (delay_to[j] >= 0 && t >= time[0]) {
+            if (delay_to[j] >= 0) {
                 /* dy/d(delay) = -C dx/dt, by a difference along the trajectory. */
                 double ahead[NX], value[NY], w[W], e = 1e-6;
                 for (int i = 0; i < NX; i++) ahead[i] = late_x[i] + e * hd[(size_t)b * NX + i];

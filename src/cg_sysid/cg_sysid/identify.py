@@ -27,6 +27,7 @@ from cg_sysid.trial import Trial
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
+BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 DRIFT = 1e-4  # relative change of the cost at which a fit has converged
 
 
@@ -364,6 +365,7 @@ def fit(
     motions: Sequence[np.ndarray] | None = None,
     iterations: int = 60,
     reweight: bool = True,
+    horizon: float = np.inf,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -374,6 +376,7 @@ def fit(
         motions: Initial motion of each trial to start from; by default the trials' own guess.
         iterations: Limit for the last, full-length stage.
         reweight: Let the weights follow the residual that is left.
+        horizon: Use only this much of each record, in s: a cheap first look.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -385,7 +388,7 @@ def fit(
     problem = _Problem(model, trials, unknowns)
     theta = np.array([u.to_coordinate(u.start) for u in unknowns])
     motions = [np.array(m) for m in (motions or [t.motion for t in trials])]
-    longest = max(trial.duration for trial in trials)
+    longest = min(max(trial.duration for trial in trials), horizon)
     weight = 1.0
     stages = [h for h in HORIZONS if h < 0.8 * longest]
     for horizon in stages:
@@ -394,9 +397,9 @@ def fit(
         if found[2] is not None:
             theta, motions = found[0], found[1]
             weight = _weight(found[2]) if reweight else 1.0
-    for attempt in range(4):
+    for _ in range(max(1, iterations // BETWEEN_WEIGHTS)):
         theta, motions, point, converged = _minimise(
-            problem, theta, motions, longest, weight, iterations, DRIFT
+            problem, theta, motions, longest, weight, BETWEEN_WEIGHTS, DRIFT
         )
         if point is None:
             raise IdentificationError(
@@ -405,7 +408,7 @@ def fit(
                 'records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(point) if reweight else 1.0
-        if abs(np.log(new / weight)) < 0.1 or attempt == 3:
+        if converged and abs(np.log(new / weight)) < 0.1:
             break
         weight = new
     values = problem.values(theta)
@@ -454,7 +457,8 @@ def _uncertainty(problem: _Problem, point: _Point) -> tuple[np.ndarray, np.ndarr
     covariance = inverse / np.outer(scale, scale)
     lost = (vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6
     covariance[lost, lost] = np.inf
-    information = 1 - np.clip(np.diag(covariance) * belief, 0, 1)
+    certain = np.where(belief > 0, np.diag(covariance), 0.0)
+    information = 1 - np.clip(certain * belief, 0, 1)
     information[lost] = 0.0
     return covariance, information
 

@@ -1,0 +1,269 @@
+"""Rollouts on CasADi's virtual machine: what rollout.c does, where there is no C compiler.
+
+One Runge-Kutta step of the state, and one of the variational equations by all initial states, all
+free parameters and the delay, are CasADi functions; `mapaccum` chains them over a chunk of steps.
+The sensitivities that a caller asks for follow by the chain rule. Arguments and results are
+those of the functions in rollout.c, arrays that are filled included.
+"""
+
+import functools
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import Equations
+
+CHUNK = 128
+STATE_LIMIT = 1e6
+
+
+class InterpretedRollout:
+    """The functions of rollout.c for one set of equations.
+
+    Args:
+        equations: The model.
+        free: Names of the parameters with sensitivities.
+    """
+
+    def __init__(self, equations: Equations, free: tuple[str, ...]):
+        e = self.equations = equations
+        self.nx, self.nu, self.ny = e.x.shape[0], e.u.shape[0], e.outputs.shape[0]
+        self.nf = len(free)
+        where = [e.parameter_names.index(name) for name in free]
+        self._free = ca.vertcat(*(e.p[i] for i in where)) if where else ca.SX(0, 1)
+        self._f = ca.Function('f', [e.x, e.u, e.p], [e.rates])
+        self._h = ca.Function('h', [e.x, e.u, e.p], [e.outputs])
+
+    # --- the interface of rollout.c ---------------------------------------------------------
+
+    def cgm_advance(self, x, u, p, h: float, n: int) -> None:
+        """N Runge-Kutta steps of h seconds, in place."""
+        steps = np.full(n, h)
+        path = self._chain(self._step, x, np.repeat(u[:, None], n, 1), p, steps)
+        if n:
+            x[:] = path[:, -1]
+
+    def cgm_simulate(self, n: int, dt, largest: float, u, x0, p, X) -> int:
+        """States at all rows; the number of rows before the state ran away."""
+        X[0] = x0
+        row, held, steps = _fine(dt, u, largest)
+        path = self._chain(self._step, x0, held, p, steps)
+        X[1:] = path[:, row].T
+        return _sane_rows(X)
+
+    def cgm_outputs(self, n: int, time, u, p, X, delay, Y) -> None:
+        """Outputs of given states, late by the delays."""
+        Y[:] = np.asarray(self._h(X.T, u.T, p)).T
+        if not (delay > 0).any():
+            return
+        slopes = np.asarray(self._f(X.T, u.T, p)).T
+        # At the later end of an interval the held input is its own, as in rollout.c.
+        for j in np.flatnonzero(delay > 0):
+            at, late = _interpolate(time, time - delay[j], X, slopes)
+            Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
+
+    def cgm_normal(
+        self, n, time, largest, u, du, delay_column, x0, S0, p, nc, column, measured, weight,
+        delay, delay_to, history, H, g, sse, count, Y, Jacobian,
+    ) -> int:  # fmt: skip
+        """Normal equations of the simulation error (Eq. 4.13)."""
+        nx, ny = self.nx, self.ny
+        width = nx + self.nf + 1
+        # Columns of the full variational equations: initial state, free parameters, delay.
+        chain = np.zeros((width, nc))
+        chain[:nx] = S0
+        for f in np.flatnonzero(column >= 0):
+            chain[nx + f, column[f]] += 1
+        if delay_column >= 0:
+            chain[-1, delay_column] += 1
+        start = np.concatenate([x0, np.eye(nx, width).ravel(order='F')])
+        row, held, steps = _fine(np.diff(time), np.hstack([u, du]), largest)
+        path = self._chain(self._sensitive_step, start, held, p, steps)
+        rows = np.hstack([start[:, None], path[:, row]]).T
+        states = np.ascontiguousarray(rows[:, :nx])
+        good = _sane_rows(states)
+        states = states[:good]
+        S = _matrices(rows[:good, nx:], nx, width) @ chain
+        time, u, du, measured = time[:good], u[:good], du[:good], measured[:good]
+        y, J = self._sensitive_outputs(states, S, u, p, column)
+        slopes = slopes_S = None
+        for j in range(ny):
+            if delay[j] <= 0 and delay_to[j] < 0:
+                continue
+            if slopes is None:
+                slopes, slopes_S = self._slopes(states, S, u, du, delay_column, p, column)
+            t = time - delay[j]
+            at, late = _interpolate(time, t, states, slopes)
+            flat, flat_slopes = S.reshape(good, -1), slopes_S.reshape(good, -1)
+            late_S = _interpolate(time, t, flat, flat_slopes)[1].reshape(S.shape)
+            late_y, late_J = self._sensitive_outputs(late, late_S, u[at], p, column)
+            y[:, j], J[:, j] = late_y[:, j], late_J[:, j]
+            if delay_to[j] >= 0:
+                e = 1e-6
+                ahead = late + e * slopes[at]
+                value = np.asarray(self._h(ahead.T, u[at].T, p))[j]
+                moving = t >= time[0]
+                J[moving, j, delay_to[j]] -= (value - late_y[:, j])[moving] / e
+        if Y is not None:
+            Y[:good] = y
+        if Jacobian is not None:
+            Jacobian[:good] = J
+        there = ~np.isnan(measured)
+        residual = np.where(there, y - measured, 0.0) * weight
+        weighted = np.where(there[:, :, None], J, 0.0) * weight[:, None]
+        sse += (residual**2).sum(axis=0)
+        count += there.sum(axis=0)
+        weighted = weighted.reshape(-1, nc)
+        g += weighted.T @ residual.ravel()
+        H += weighted.T @ weighted
+        return good
+
+    # --- CasADi functions, built when first needed --------------------------------------------
+
+    @functools.cached_property
+    def _step(self) -> ca.Function:
+        e = self.equations
+        u, h = ca.SX.sym('u', self.nu), ca.SX.sym('h')
+        x = _runge_kutta(lambda y: self._f(y, u, e.p), e.x, h)
+        return _accumulate(e.x, u, e.p, h, x)
+
+    @functools.cached_property
+    def _sensitive_step(self) -> ca.Function:
+        e, width = self.equations, self.nx + self.nf + 1
+        derivatives = ca.Function(
+            'fs',
+            [e.x, e.u, e.p],
+            [
+                e.rates,
+                ca.jacobian(e.rates, e.x),
+                ca.jacobian(e.rates, e.u),
+                ca.jacobian(e.rates, self._free),
+            ],
+        )
+        u, du, h = ca.SX.sym('u', self.nu), ca.SX.sym('du', self.nu), ca.SX.sym('h')
+        state = ca.SX.sym('state', self.nx * (1 + width))
+
+        def rates(y):
+            S = ca.reshape(y[self.nx :], self.nx, width)
+            f, A, B, P = derivatives(y[: self.nx], u, e.p)
+            forcing = ca.horzcat(ca.SX.zeros(self.nx, self.nx), P, ca.mtimes(B, du))
+            return ca.vertcat(f, ca.vec(ca.mtimes(A, S) + forcing))
+
+        return _accumulate(state, ca.vertcat(u, du), e.p, h, _runge_kutta(rates, state, h))
+
+    @functools.cached_property
+    def _hs(self) -> ca.Function:
+        e = self.equations
+        return ca.Function(
+            'hs',
+            [e.x, e.u, e.p],
+            [
+                e.outputs,
+                ca.densify(ca.vec(ca.jacobian(e.outputs, e.x))),
+                ca.densify(ca.vec(ca.jacobian(e.outputs, self._free))),
+            ],
+        )
+
+    @functools.cached_property
+    def _fs(self) -> ca.Function:
+        e = self.equations
+        return ca.Function(
+            'fs',
+            [e.x, e.u, e.p],
+            [
+                e.rates,
+                ca.densify(ca.vec(ca.jacobian(e.rates, e.x))),
+                ca.densify(ca.vec(ca.jacobian(e.rates, e.u))),
+                ca.densify(ca.vec(ca.jacobian(e.rates, self._free))),
+            ],
+        )
+
+    def _chain(self, function, x, inputs, p, steps) -> np.ndarray:
+        """States after each of the fine steps, shape (n, steps)."""
+        done, x = [], np.array(x, float)
+        for begin in range(0, len(steps), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            size = len(steps[part])
+            # Steps of no length fill the last chunk: one function serves all lengths.
+            u = np.zeros((inputs.shape[0], CHUNK))
+            h = np.zeros((1, CHUNK))
+            u[:, :size], h[0, :size] = inputs[:, part], steps[part]
+            path = np.asarray(function(x, u, p, h))[:, :size]
+            done.append(path)
+            x = path[:, -1]
+        return np.hstack(done) if done else np.zeros((len(x), 0))
+
+    def _sensitive_outputs(self, states, S, u, p, column):
+        y, C, D = (np.asarray(a) for a in self._hs(states.T, u.T, p))
+        n = len(states)
+        J = _matrices(C.T, self.ny, self.nx) @ S
+        self._place(J, _matrices(D.T, self.ny, self.nf), column)
+        return y.T.copy().reshape(n, self.ny), J
+
+    def _slopes(self, states, S, u, du, delay_column, p, column):
+        f, A, B, P = (np.asarray(a) for a in self._fs(states.T, u.T, p))
+        dS = _matrices(A.T, self.nx, self.nx) @ S
+        self._place(dS, _matrices(P.T, self.nx, self.nf), column)
+        if delay_column >= 0:
+            B = _matrices(B.T, self.nx, self.nu)
+            dS[:, :, delay_column] += np.einsum('kij,kj->ki', B, du)
+        return f.T, dS
+
+    @staticmethod
+    def _place(J, by_free, column) -> None:
+        for f in np.flatnonzero(column >= 0):
+            J[:, :, column[f]] += by_free[:, :, f]
+
+
+def _runge_kutta(rates, x, h):
+    k1 = rates(x)
+    k2 = rates(x + h / 2 * k1)
+    k3 = rates(x + h / 2 * k2)
+    k4 = rates(x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def _accumulate(x, u, p, h, x_next) -> ca.Function:
+    step = ca.Function('step', [x, u, p, h], [ca.cse(x_next)])
+    chain = step.mapaccum('chain', CHUNK)
+    # mapaccum wants p once per step; hand it one column and repeat it inside.
+    X0, U = ca.MX.sym('x', x.shape[0]), ca.MX.sym('u', u.shape[0], CHUNK)
+    P, steps = ca.MX.sym('p', p.shape[0]), ca.MX.sym('h', 1, CHUNK)
+    return ca.Function('chain', [X0, U, P, steps], [chain(X0, U, ca.repmat(P, 1, CHUNK), steps)])
+
+
+def _fine(dt, u, largest):
+    """Fine steps: index of the last one of each row, input (nu, n) and length of each."""
+    counts = np.maximum(1, np.ceil(dt / largest * (1 - 1e-9)).astype(int))
+    return (
+        np.cumsum(counts) - 1,
+        np.repeat(u[:-1], counts, axis=0).T,
+        np.repeat(dt / counts, counts),
+    )
+
+
+def _sane_rows(states) -> int:
+    bad = ~(np.abs(states) < STATE_LIMIT).all(axis=1)
+    bad[0] = False
+    return int(np.argmax(bad)) if bad.any() else len(states)
+
+
+def _matrices(columns, rows: int, width: int) -> np.ndarray:
+    """Rows of column-major matrices, (n, rows * width), as an array (n, rows, width)."""
+    return columns.reshape(len(columns), width, rows).transpose(0, 2, 1)
+
+
+def _interpolate(time, t, X, slopes):
+    """Row that is before each t, and the cubic Hermite value there; held at the ends."""
+    at = np.clip(np.searchsorted(time, t, side='right') - 1, 0, len(time) - 1)
+    after = np.minimum(at + 1, len(time) - 1)
+    h = np.where(after > at, time[after] - time[at], 1.0)
+    s = np.where((after > at) & (t > time[0]), (t - time[at]) / h, 0.0)[:, None]
+    h, r = h[:, None], 1 - s
+    value = (
+        (1 + 2 * s) * r**2 * X[at]
+        + (1 + 2 * r) * s**2 * X[after]
+        + h * s * r**2 * slopes[at]
+        - h * r * s**2 * slopes[after]
+    )
+    return at, value

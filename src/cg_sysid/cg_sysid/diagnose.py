@@ -1,0 +1,608 @@
+"""Diagnosis: what a simulation gets wrong, the cause, and the gain of a model that has it.
+
+    fit the nominal model -> is the residual more than noise?
+      -> fit every effect of the library on top -> rank by evidence -> accept the best if it is
+         earned on records held out -> again on top of that, until nothing more is earned
+      -> look again at each accepted effect: could another take its place?
+
+docs/diagnosis.md says how the decisions are taken and why.
+"""
+
+import itertools
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+
+from cg_sysid.evidence import block_gain, evidence, independent_samples
+from cg_sysid.identify import Fit, IdentificationError, fit, predict, score
+from cg_sysid.parallel import run_all
+from cg_sysid.record import Record
+from cg_sysid.trial import Trial, prepare
+
+log = logging.getLogger(__name__)
+
+MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
+# No model is trusted to describe a machine better than this share of the noise power: rivals whose
+# chi2/N differ by less are not told apart, however many samples say so.
+FIDELITY = 2e-3
+EARNED = 10.0  # nats an effect must gain over the model without it
+MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
+AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
+SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall
+MOST_ROUNDS = 4
+SCREEN_S = 2.0  # length of the first look at each start of a candidate
+BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
+MOST_STARTS = 8
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Simulation error of one output before and after, on records held out.
+
+    Attributes:
+        channel: Output channel.
+        unit: Its unit.
+        before: RMS error of the nominal model, identified anew, in `unit`.
+        after: RMS error of the extended model.
+        noise: Noise floor of the sensor.
+    """
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect tried on top of a base model.
+
+    Attributes:
+        label: Effect label.
+        model: Base model plus the effect, identified on the training records.
+        train: Fit on the training records.
+        held: Score on the held-out records.
+        evidence: In nats against the base model: positive speaks for the effect.
+        held_gain: Fall of the held-out squared error, relative.
+        significance: The same in standard errors over blocks.
+        explained: RMS error explained on held-out records, in noise standard deviations, of the
+            output where it is largest.
+        parameters: Own parameters: name -> (value, standard deviation, unit).
+        reason: Why it was not accepted; empty if it could be.
+    """
+
+    label: str
+    model: Model
+    train: Fit
+    held: Fit
+    evidence: float
+    held_gain: float
+    significance: float
+    explained: float
+    parameters: dict[str, tuple[float, float, str]]
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class Round:
+    """All candidates tried on top of one base model, best first, and what was made of them."""
+
+    base: str
+    candidates: tuple[Candidate, ...]
+    accepted: str
+    independent: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A named cause: an accepted effect and what these data cannot rule out beside it.
+
+    Attributes:
+        label: Label of the effect.
+        parameters: Own parameters: name -> (value, standard deviation, unit).
+        evidence: In nats against the model without it.
+        rivals: Other effects that explain the records as well.
+        places: Labels of the same effect at other places that explain the records as well.
+    """
+
+    label: str
+    parameters: dict[str, tuple[float, float, str]]
+    evidence: float
+    rivals: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer.
+
+    Attributes:
+        verdict: consistent, explained, ambiguous, unexplained or unusable.
+        summary: One sentence for people.
+        causes: Named causes, strongest first.
+        gains: Simulation error before and after on held-out records.
+        nominal: The model as it was given.
+        baseline: The same, its parameters identified on the training records.
+        extended: The model with the causes in it, identified on the training records.
+        rounds: What was tried, in order.
+        train: Trials used for fitting.
+        held: Trials held out.
+        remaining: chi2/N of each output that the extended model leaves on held-out records.
+        findings: What a person should know: warnings of the fits, lumps out of tolerance.
+    """
+
+    verdict: str
+    summary: str
+    causes: tuple[Cause, ...]
+    gains: tuple[Gain, ...]
+    nominal: Model
+    baseline: Candidate
+    extended: Candidate
+    rounds: tuple[Round, ...]
+    train: tuple[Trial, ...]
+    held: tuple[Trial, ...]
+    remaining: dict[str, float]
+    findings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a diagnosis is done.
+
+    Attributes:
+        effects: Labels or names to try; by default the whole library.
+        rounds: Most effects to add.
+        workers: Local processes.
+    """
+
+    effects: tuple[str, ...] | None = None
+    rounds: int = MOST_ROUNDS
+    workers: int | None = None
+
+
+def split(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
+    """Training and held-out trials: within each set-up, every second one is held out.
+
+    Raises:
+        IdentificationError: if there are fewer than two.
+    """
+    if len(trials) < 2:
+        raise IdentificationError(
+            f'{len(trials)} record: a diagnosis needs at least two, one to fit and one to judge; '
+            'record another, or cut a long one into windows (--window SECONDS)'
+        )
+    groups: dict[str, list[Trial]] = {}
+    for trial in trials:
+        groups.setdefault(repr(trial.setup), []).append(trial)
+    train, held = [], []
+    single = 0
+    for group in groups.values():
+        if len(group) == 1:
+            # Set-ups recorded once go to training first, so that every set-up is fitted.
+            (train if single % 2 == 0 else held).append(group[0])
+            single += 1
+            continue
+        train += group[0::2]
+        held += group[1::2]
+    if not held:
+        held.append(train.pop())
+    return train, held
+
+
+def candidates_for(model: Model, names: Sequence[str] | None = None) -> list[tuple[str, str | None]]:
+    """(effect, at) of everything in the library that the model does not have yet."""
+    present = {effect.label for effect in model.effects}
+    found = []
+    for name, effect in LIBRARY.items():
+        for at in effect.sites(model.mechanism):
+            made = effect(model.mechanism, at)
+            wanted = names is None or name in names or made.label in names
+            if wanted and made.label not in present:
+                found.append((name, made.at))
+    if names is not None and not found:
+        raise IdentificationError(
+            f'none of the effects {", ".join(names)} can be tried; the library has: '
+            f'{", ".join(LIBRARY)}'
+        )
+    return found
+
+
+def starts_of(name: str) -> list[dict[str, float]]:
+    """Values of an effect's parameters from which its identification sets out."""
+    grids = [
+        [(p.name, start) for start in p.starts] if p.free else [(p.name, p.default)]
+        for p in LIBRARY[name].parameters
+    ]
+    return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One candidate to fit: an effect (or None for the base alone) on top of a model."""
+
+    model: Model
+    effect: tuple[str, str | None] | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What fitting a task gave: fits on both sets and the residuals over noise."""
+
+    task: Task
+    label: str
+    model: Model
+    train: Fit
+    held: Fit
+    residuals: tuple[np.ndarray, ...] = field(repr=False)
+    belief: float
+    unknowns: int
+
+
+def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
+    """Fit one candidate on the training trials and score it on the held-out ones.
+
+    Returns:
+        The outcome, or a sentence saying why there is none.
+    """
+    try:
+        best = _best_fit(task, train)
+        held_score = score(best.model, held)
+        model = _believing(best.model, task.model)
+        residuals = tuple(
+            (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
+            for trial, motion in zip(
+                (*train, *held), (*best.motions, *held_score.motions), strict=True
+            )
+        )
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+    belief = sum(
+        ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
+        for u, v in zip(best.unknowns, best.values, strict=True)
+        if np.isfinite(u.tolerance)
+    )
+    label = best.model.effects[-1].label if task.effect else task.model.name
+    return Outcome(
+        task, label, model, best, held_score, residuals, belief, len(best.unknowns)
+    )
+
+
+def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    # A short horizon tells which start is worth going on from. The full fit then sets out from
+    # the centre of belief again: the optimum of a short horizon is a poor place for the lumps.
+    models = list(_starting_models(task))
+    if len(models) > 1:
+        looks = []
+        for model in models:
+            try:
+                looks.append((fit(model, train, horizon=SCREEN_S, iterations=8), model))
+            except IdentificationError as error:
+                failure = error
+        if not looks:
+            raise failure
+        looks.sort(key=lambda look: look[0].normalised_error)
+        best, start = looks[0]
+        label = start.effects[-1].label
+        models = [
+            start.with_values({n: v for n, v in best.model.values.items()
+                               if n.startswith(f'{label}.')})
+        ]
+    return fit(models[0], train)
+
+
+def _starting_models(task: Task):
+    if task.effect is None:
+        yield task.model
+        return
+    name, at = task.effect
+    for start in starts_of(name):
+        yield task.model.with_effect(name, at, **start)
+
+
+def _believing(fitted: Model, base: Model) -> Model:
+    # The next fit starts at the identified values but believes what the file believed.
+    quantities = dict(fitted.quantities)
+    for name, q in base.quantities.items():
+        quantities[name] = replace(quantities[name], tolerance=q.tolerance, source=q.source)
+    for name, q in quantities.items():
+        if name not in base.quantities:
+            quantities[name] = replace(q, tolerance=None)
+    return replace(fitted, quantities=quantities)
+
+
+def diagnose(
+    model: Model,
+    records: Sequence[Record],
+    options: Options | None = None,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+) -> Diagnosis:
+    """Say what a model gets wrong about records of its machine.
+
+    Args:
+        model: The nominal model.
+        records: At least two recordings that passed the check.
+        options: How.
+        progress: Called with (what, done, total).
+        executor: Where candidates are fitted; by default local processes.
+
+    Raises:
+        IdentificationError: if the records cannot be used with this model.
+    """
+    options = options or Options()
+    train, held = split(prepare(model, records))
+    search = _Search(model, train, held, options, progress or (lambda *_: None), executor)
+    return search.run()
+
+
+class _Search:
+    """State of one diagnosis: the current base and what has been tried."""
+
+    def __init__(self, model, train, held, options, progress, executor):
+        self.nominal, self.options, self.progress = model, options, progress
+        self.train, self.held, self.executor = train, held, executor
+        self.rounds: list[Round] = []
+        trials = (*train, *held)
+        self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
+        self.rows_per_block = max(1, int(BLOCK_S / np.median(self.steps)))
+
+    def run(self) -> Diagnosis:
+        base = self._fit([Task(self.nominal)], 'nominal model')[0]
+        if isinstance(base, str):
+            raise IdentificationError(base)
+        nominal = base
+        accepted: list[Outcome] = []
+        while len(accepted) < self.options.rounds and not self._at_noise(base):
+            ranked, independent = self._round(base)
+            best = next((c for c in ranked if not c[0].reason), None)
+            self.rounds.append(
+                Round(
+                    ' + '.join(['nominal', *(o.label for o in accepted)]),
+                    tuple(c for c, _ in ranked),
+                    best[0].label if best else '',
+                    independent,
+                )
+            )
+            if best is None:
+                break
+            accepted.append(best[1])
+            base = best[1]
+        causes, final = self._review(nominal, base, accepted)
+        return self._conclude(nominal, final, causes)
+
+    def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
+        return run_all(
+            try_candidate,
+            [(task, self.train, self.held) for task in tasks],
+            workers=self.options.workers,
+            executor=self.executor,
+            progress=lambda done, total: self.progress(what, done, total),
+        )
+
+    def _round(self, base: Outcome) -> tuple[list[tuple[Candidate, Outcome]], float]:
+        tasks = [Task(base.model, c) for c in candidates_for(base.model, self.options.effects)]
+        outcomes = self._fit(tasks, f'effects on top of {base.label}')
+        for task, outcome in zip(tasks, outcomes, strict=True):
+            if isinstance(outcome, str):
+                log.info('%s: %s', task.effect, outcome)
+        good = [o for o in outcomes if isinstance(o, Outcome)]
+        return self._rank(base, good)
+
+    def _rank(
+        self, base: Outcome, outcomes: list[Outcome]
+    ) -> tuple[list[tuple[Candidate, Outcome]], float]:
+        if not outcomes:
+            return [], 2.0
+        leader = min([base, *outcomes], key=_chi2)
+        independent = independent_samples(leader.residuals, self.steps)
+        reference = self._evidence(base, independent)
+        ranked = [
+            (self._judge(base, o, reference - self._evidence(o, independent)), o)
+            for o in outcomes
+        ]
+        ranked.sort(key=lambda pair: -pair[0].evidence)
+        return ranked, independent
+
+    def _evidence(self, o: Outcome, independent: float) -> float:
+        samples = o.train.count.sum() + o.held.count.sum()
+        return evidence(_chi2(o), samples, independent, o.unknowns, o.belief)
+
+    def _judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
+        n = len(self.train)  # residuals: training trials first, then those held out
+        drop, error = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
+        before = _per_output(base.held)
+        after = _per_output(o.held)
+        explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
+        held_gain = 1 - o.held.normalised_error / base.held.normalised_error
+        reasons = []
+        if gained < EARNED:
+            reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
+        if not drop > SIGNIFICANT * error:
+            reasons.append('no significant gain on held-out records')
+        if explained < MATERIAL:
+            reasons.append(f'explains {explained:.2f} noise standard deviations, '
+                           f'{MATERIAL:g} needed')
+        reasons += _at_edge(o)
+        return Candidate(
+            label=o.label,
+            model=o.model,
+            train=o.train,
+            held=o.held,
+            evidence=float(gained),
+            held_gain=float(held_gain),
+            significance=float(drop / error) if error > 0 else 0.0,
+            explained=explained,
+            parameters=_own_parameters(o),
+            reason='; '.join(reasons),
+        )
+
+    def _at_noise(self, o: Outcome) -> bool:
+        return bool(
+            (_per_output(o.train) < AT_NOISE).all() and (_per_output(o.held) < AT_NOISE).all()
+        )
+
+    def _review(
+        self, nominal: Outcome, final: Outcome, accepted: list[Outcome]
+    ) -> tuple[list[Cause], Outcome]:
+        """For each accepted effect: what if it were another one, beside the rest?"""
+        labels = [o.label for o in accepted]
+        if len(accepted) == 1:
+            # The first round has already asked.
+            return [self._cause(final, labels[0], self.rounds[0].candidates)], final
+        causes = []
+        for label in labels:
+            without = final.model.without_effect(label)
+            (lean,) = self._fit([Task(without)], f'model without {label}')
+            if isinstance(lean, str):
+                causes.append(Cause(label, _parameters_of(final, label), np.inf))
+                continue
+            ranked, independent = self._round(lean)
+            candidates = tuple(c for c, _ in ranked)
+            base = ' + '.join(['nominal', *(x for x in labels if x != label)])
+            self.rounds.append(Round(base, candidates, label, independent))
+            causes.append(self._cause(final, label, candidates))
+        causes.sort(key=lambda cause: -cause.evidence)
+        return causes, final
+
+    def _cause(self, final: Outcome, label: str, candidates: Sequence[Candidate]) -> Cause:
+        own = next(c for c in candidates if c.label == label)
+        samples = own.train.count.sum() + own.held.count.sum()
+        margin = max(MARGIN, FIDELITY * samples / 2)
+        close = [
+            c.label
+            for c in candidates
+            if c.label != label and not c.reason and c.evidence > own.evidence - margin
+        ]
+        name = label.partition('@')[0]
+        return Cause(
+            label,
+            _parameters_of(final, label),
+            own.evidence,
+            rivals=tuple(c for c in close if c.partition('@')[0] != name),
+            places=tuple(c for c in close if c.partition('@')[0] == name),
+        )
+
+    def _conclude(self, nominal: Outcome, final: Outcome, causes: list[Cause]) -> Diagnosis:
+        remaining = dict(
+            zip(self.nominal.mechanism.outputs, _per_output(final.held), strict=True)
+        )
+        left = {c: v for c, v in remaining.items() if v > (1 + MATERIAL) ** 2}
+        if not causes:
+            verdict = 'unexplained' if left else 'consistent'
+        elif any(cause.rivals for cause in causes):
+            verdict = 'ambiguous'
+        else:
+            verdict = 'explained'
+        gains = _gains(self.nominal, self.held, nominal.held, final.held)
+        reference = self._judge(nominal, nominal, 0.0)
+        extended = self._judge(nominal, final, sum(c.evidence for c in causes))
+        return Diagnosis(
+            verdict=verdict,
+            summary=_summary(verdict, causes, gains, left),
+            causes=tuple(causes),
+            gains=gains,
+            nominal=self.nominal,
+            baseline=replace(reference, reason=''),
+            extended=replace(extended, reason=''),
+            rounds=tuple(self.rounds),
+            train=tuple(self.train),
+            held=tuple(self.held),
+            remaining={c: float(v) for c, v in remaining.items()},
+            findings=tuple(final.train.warnings),
+        )
+
+
+def _chi2(o: Outcome) -> float:
+    return float((o.train.mse * o.train.count).sum() + (o.held.mse * o.held.count).sum())
+
+
+def _per_output(fit: Fit) -> np.ndarray:
+    """chi2/N of each output over all trials; 0 for an output without samples."""
+    return (fit.mse * fit.count).sum(axis=0) / np.maximum(fit.count.sum(axis=0), 1)
+
+
+def _own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
+    return _parameters_of(o, o.label)
+
+
+def _parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
+    prefix = f'{label}.'
+    return {
+        u.name.removeprefix(prefix): (float(v), float(s), u.unit)
+        for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
+        if u.name.startswith(prefix)
+    }
+
+
+def _at_edge(o: Outcome) -> list[str]:
+    """A parameter at the edge of its range says that the effect is not what is meant."""
+    found = []
+    for u, v in zip(o.train.unknowns, o.train.values, strict=True):
+        if not u.name.startswith(f'{o.label}.'):
+            continue
+        low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
+                         for x in (u.lower, u.upper, v))
+        if min(at - low, high - at) < 1e-3 * (high - low):
+            found.append(f'{u.name} = {v:.3g} {u.unit} lies at the edge of its range')
+    return found
+
+
+def _gains(
+    model: Model, held: Sequence[Trial], before: Fit, after: Fit
+) -> tuple[Gain, ...]:
+    sigma = held[0].sigma
+    return tuple(
+        Gain(channel, unit, float(s * np.sqrt(b)), float(s * np.sqrt(a)), float(s))
+        for channel, unit, s, b, a, n in zip(
+            model.mechanism.outputs,
+            model.mechanism.output_units,
+            sigma,
+            _per_output(before),
+            _per_output(after),
+            before.count.sum(axis=0),
+            strict=True,
+        )
+        if n
+    )
+
+
+def _summary(
+    verdict: str, causes: Sequence[Cause], gains: Sequence[Gain], left: dict[str, float]
+) -> str:
+    if verdict == 'consistent':
+        return 'The model explains the records down to the noise of the sensors.'
+    biggest = max(gains, key=lambda g: g.before / g.noise)
+    if verdict == 'unexplained':
+        return (
+            f'Something is missing that no effect of the library explains: {biggest.channel} is '
+            f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
+            f'{biggest.noise:.2g}.'
+        )
+    named = ', '.join(
+        f'{c.label} ({_described(c)})' + (f' or {" or ".join(c.rivals)}' if c.rivals else '')
+        for c in causes
+    )
+    text = (
+        f'The simulation lacks {named}; with it the held-out error of {biggest.channel} falls '
+        f'from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
+        f'(noise {biggest.noise:.2g}).'
+    )
+    if left:
+        text += f' An error above the noise remains in {", ".join(left)}.'
+    return text
+
+
+def _described(cause: Cause) -> str:
+    return ', '.join(
+        f'{name} = {value:.3g} +- {sigma:.1g} {unit}'
+        for name, (value, sigma, unit) in cause.parameters.items()
+    )

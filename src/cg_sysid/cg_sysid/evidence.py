@@ -1,0 +1,94 @@
+"""How strongly data speak for one model against another: theory.md, (EV).
+
+With chi2 the squared simulation error over noise variance, N its number of samples and N_eff the
+number of *independent* ones, a model with k parameters of its own has the evidence (in nats,
+smaller is better)
+
+    E = N_eff/2 log(chi2/N) + k/2 log(N_eff) + belief/2                              (EV)
+
+The logarithm is the Gaussian likelihood with the size of the error unknown: where a model reaches
+the noise it is the usual chi2/2, where model error dominates only ratios count. N_eff comes from
+the autocorrelation of what the best model leaves, so that a residual that is one slow wave does
+not count as ten thousand proofs. `belief` is the squared distance of the parameters from what the
+model file believes, in its own standard deviations.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+LONGEST_LAG = 1.0  # s; correlation beyond is motion of the whole record, not memory
+
+
+def correlation_time(residual: np.ndarray, step: float) -> float:
+    """Integrated autocorrelation time of a residual in samples, at least 1.
+
+    Args:
+        residual: One channel of one record, shape (n,), NaN where there is no sample.
+        step: Sampling interval in s.
+    """
+    r = residual[np.isfinite(residual)]
+    if len(r) < 16:
+        return 1.0
+    n = len(r)
+    # A constant misfit is correlated for ever: about zero, not about the mean.
+    spectrum = np.abs(np.fft.rfft(r, 2 * n)) ** 2
+    covariance = np.fft.irfft(spectrum)[:n]
+    if covariance[0] <= 0:
+        return 1.0
+    rho = covariance / covariance[0]
+    last = min(n - 1, max(1, int(LONGEST_LAG / step)))
+    # Sum until the correlation is lost in its own scatter (Geyer's rule, simplified).
+    below = np.flatnonzero(rho[1 : last + 1] < 2 / np.sqrt(n))
+    stop = int(below[0]) if len(below) else last
+    return float(1 + 2 * rho[1 : stop + 1].sum())
+
+
+def independent_samples(residuals: Sequence[np.ndarray], steps: Sequence[float]) -> float:
+    """N_eff: independent samples in the residuals of all records.
+
+    Args:
+        residuals: Simulated minus measured of each record, shape (n, ny), over noise.
+        steps: Sampling interval of each record in s.
+    """
+    total = 0.0
+    for residual, step in zip(residuals, steps, strict=True):
+        for channel in residual.T:
+            count = np.isfinite(channel).sum()
+            if count:
+                total += count / correlation_time(channel, step)
+    return max(total, 2.0)
+
+
+def evidence(
+    chi2: float, samples: float, independent: float, parameters: int, belief: float
+) -> float:
+    """(EV), in nats; smaller is better."""
+    return (
+        independent / 2 * np.log(chi2 / samples)
+        + parameters / 2 * np.log(independent)
+        + belief / 2
+    )
+
+
+def block_gain(
+    before: Sequence[np.ndarray], after: Sequence[np.ndarray], rows: int
+) -> tuple[float, float]:
+    """Mean drop of the squared error per block of rows, and its standard error.
+
+    A gain that comes from one lucky moment has a large standard error.
+
+    Args:
+        before: Residual of each record over noise, shape (n, ny).
+        after: The same with the other model.
+        rows: Rows per block.
+    """
+    drops = []
+    for a, b in zip(before, after, strict=True):
+        difference = np.nansum(a**2 - b**2, axis=1)
+        blocks = max(1, len(difference) // rows)
+        drops += [part.mean() for part in np.array_split(difference, blocks)]
+    values = np.array(drops)
+    if len(values) < 2:
+        return float(values.mean()), np.inf
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))

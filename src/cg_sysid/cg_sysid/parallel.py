@@ -1,0 +1,50 @@
+"""Independent pieces of work on the cores of this machine, results in order."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from typing import Any
+
+_pool: ProcessPoolExecutor | None = None
+
+
+def run_all(
+    function: Callable[..., Any],
+    arguments: Sequence[tuple],
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Any]:
+    """function(*a) for each a in arguments, in parallel.
+
+    Args:
+        function: Importable, with arguments and result that can be pickled.
+        arguments: One tuple per call.
+        workers: Local processes; by default one per core, 0 or 1 to stay in this process.
+        executor: Use this instead.
+        progress: Called with (done, total).
+    """
+    total = len(arguments)
+    if executor is None and (total < 2 or (workers is not None and workers < 2)):
+        results = []
+        for done, a in enumerate(arguments, start=1):
+            results.append(function(*a))
+            progress(done, total)
+        return results
+    futures = [(executor or _local(workers)).submit(function, *a) for a in arguments]
+    for done, future in enumerate(as_completed(futures), start=1):
+        future.result()
+        progress(done, total)
+    return [future.result() for future in futures]
+
+
+def _local(workers: int | None) -> ProcessPoolExecutor:
+    # One pool for the life of the process: starting it costs an import of CasADi per worker.
+    # spawn, not fork: a forked child would inherit threads' locks (DDS, BLAS) in unknown states.
+    global _pool
+    if _pool is None:
+        _pool = ProcessPoolExecutor(
+            workers or os.cpu_count(), mp_context=multiprocessing.get_context('spawn')
+        )
+    return _pool
