@@ -56,10 +56,9 @@ class InterpretedRollout:
         Y[:] = np.asarray(self._h(X.T, u.T, p)).T
         if not (delay > 0).any():
             return
-        slopes = np.asarray(self._f(X.T, u.T, p)).T
-        # At the later end of an interval the held input is its own, as in rollout.c.
+        ends = [np.asarray(self._f(x.T, v.T, p)).T for x, v in ((X, u), (X[1:], u[:-1]))]
         for j in np.flatnonzero(delay > 0):
-            at, late = _interpolate(time, time - delay[j], X, slopes)
+            at, late = _interpolate(time, time - delay[j], X, *ends)
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
     def cgm_normal(
@@ -86,24 +85,25 @@ class InterpretedRollout:
         S = _matrices(rows[:good, nx:], nx, width) @ chain
         time, u, du, measured = time[:good], u[:good], du[:good], measured[:good]
         y, J = self._sensitive_outputs(states, S, u, p, column)
-        slopes = slopes_S = None
+        slopes = None
         for j in range(ny):
             if delay[j] <= 0 and delay_to[j] < 0:
                 continue
             if slopes is None:
-                slopes, slopes_S = self._slopes(states, S, u, du, delay_column, p, column)
+                fixed = (delay_column, p, column)
+                # The input of a row is held up to the next, so it gives the slope there too.
+                slopes = self._slopes(states, S, u, du, *fixed)
+                ends = self._slopes(states[1:], S[1:], u[:-1], du[:-1], *fixed)
             t = time - delay[j]
-            at, late = _interpolate(time, t, states, slopes)
-            flat, flat_slopes = S.reshape(good, -1), slopes_S.reshape(good, -1)
-            late_S = _interpolate(time, t, flat, flat_slopes)[1].reshape(S.shape)
+            at, late = _interpolate(time, t, states, slopes[0], ends[0])
+            _, late_S = _interpolate(time, t, S, slopes[1], ends[1])
             late_y, late_J = self._sensitive_outputs(late, late_S, u[at], p, column)
             y[:, j], J[:, j] = late_y[:, j], late_J[:, j]
             if delay_to[j] >= 0:
                 e = 1e-6
-                ahead = late + e * slopes[at]
+                ahead = late + e * np.asarray(self._f(late.T, u[at].T, p)).T
                 value = np.asarray(self._h(ahead.T, u[at].T, p))[j]
-                moving = t >= time[0]
-                J[moving, j, delay_to[j]] -= (value - late_y[:, j])[moving] / e
+                J[:, j, delay_to[j]] -= (value - late_y[:, j]) / e
         if Y is not None:
             Y[:good] = y
         if Jacobian is not None:
@@ -253,17 +253,31 @@ def _matrices(columns, rows: int, width: int) -> np.ndarray:
     return columns.reshape(len(columns), width, rows).transpose(0, 2, 1)
 
 
-def _interpolate(time, t, X, slopes):
-    """Row that is before each t, and the cubic Hermite value there; held at the ends."""
-    at = np.clip(np.searchsorted(time, t, side='right') - 1, 0, len(time) - 1)
-    after = np.minimum(at + 1, len(time) - 1)
-    h = np.where(after > at, time[after] - time[at], 1.0)
-    s = np.where((after > at) & (t > time[0]), (t - time[at]) / h, 0.0)[:, None]
-    h, r = h[:, None], 1 - s
-    value = (
+def _interpolate(time, t, X, slopes, ends):
+    """Row that is before each t, and the cubic Hermite value there; straight on outside.
+
+    Args:
+        time: Stamps, shape (n,).
+        t: Where to interpolate, one for each row.
+        X: Values, shape (n, ...).
+        slopes: Rates right after each row, shape (n, ...).
+        ends: Rates right before each row but the first, shape (n - 1, ...).
+    """
+    n = len(time)
+    at = np.clip(np.searchsorted(time, t, side='right') - 1, 0, n - 1)
+    interval = np.minimum(at, n - 2)
+    shape = (n, *(1,) * (X.ndim - 1))
+    past = (t - time[at]).reshape(shape)
+    if n == 1:
+        return at, X + past * slopes
+    outside = ((at == n - 1) | (t <= time[0])).reshape(shape)
+    h = np.where(outside, 1.0, (time[interval + 1] - time[interval]).reshape(shape))
+    s = np.where(outside, 0.0, past / h)
+    r = 1 - s
+    value = np.where(outside, past * slopes[at], 0.0) + (
         (1 + 2 * s) * r**2 * X[at]
-        + (1 + 2 * r) * s**2 * X[after]
+        + (1 + 2 * r) * s**2 * X[interval + 1]
         + h * s * r**2 * slopes[at]
-        - h * r * s**2 * slopes[after]
+        - h * r * s**2 * ends[interval]
     )
     return at, value

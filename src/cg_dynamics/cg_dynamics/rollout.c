@@ -72,19 +72,17 @@ static int before(int k, double t, const double *time)
     return k;
 }
 
-static void interpolate(int rows, int width, int k, double t, const double *time, const double *X,
-                        const double *dX, double *out)
+static void interpolate(int width, double h, double past, const double *x0, const double *d0,
+                        const double *x1, const double *d1, double *out)
 {
-    /* Cubic Hermite between rows k and k+1; straight on before the first and after the last. */
-    if (k + 1 >= rows || t <= time[0]) {
-        for (int i = 0; i < width; i++)
-            out[i] = X[(size_t)k * width + i] + (t - time[k]) * dX[(size_t)k * width + i];
+    /* `past` seconds after x0: cubic Hermite to x1, h later; straight on where x1 is null. */
+    if (!x1) {
+        for (int i = 0; i < width; i++) out[i] = x0[i] + past * d0[i];
         return;
     }
-    double h = time[k + 1] - time[k], s = (t - time[k]) / h, r = 1 - s;
+    double s = past / h, r = 1 - s;
     double a0 = (1 + 2 * s) * r * r, a1 = (1 + 2 * r) * s * s;
     double b0 = h * s * r * r, b1 = -h * r * s * s;
-    const double *x0 = X + k * width, *x1 = x0 + width, *d0 = dX + k * width, *d1 = d0 + width;
     for (int i = 0; i < width; i++) out[i] = a0 * x0[i] + a1 * x1[i] + b0 * d0[i] + b1 * d1[i];
 }
 
@@ -104,9 +102,11 @@ void cgm_outputs(int n, const double *time, const double *u, const double *p, co
             if (delay[j] <= 0) continue;
             double t = time[k] - delay[j];
             int b = before(k, t, time);
-            rates(X + b * NX, u + b * NU, p, d);
-            if (b + 1 < n) rates(X + (b + 1) * NX, u + (b + 1) * NU, p, d + NX);
-            interpolate(b + 1 < n ? 2 : 1, NX, 0, t, time + b, X + b * NX, d, x);
+            /* The input of row b is held up to row b+1, so it gives the slope there too. */
+            const double *x0 = X + b * NX, *x1 = b + 1 < n && t > time[0] ? x0 + NX : 0;
+            rates(x0, u + b * NU, p, d);
+            if (x1) rates(x1, u + b * NU, p, d + NX);
+            interpolate(NX, x1 ? time[b + 1] - time[b] : 0, t - time[b], x0, d, x1, d + NX, x);
             const double *late_arg[3] = {x, u + b * NU, p};
             cgm_h(late_arg, res, 0, w, 0);
             Y[k * NY + j] = y[j];
@@ -216,15 +216,23 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
             if (delay[j] <= 0 && delay_to[j] < 0) continue;
             double t = time[k] - delay[j], slope = 0;
             int b = before(k, t, time);
-            interpolate(k + 1, NX, b, t, time, hx, hd, late_x);
-            interpolate(k + 1, ns, b, t, time, hS, hD, late_S);
+            double *x0 = hx + (size_t)b * NX, *x1 = b < k && t > time[0] ? x0 + NX : 0;
+            double *d0 = hd + (size_t)b * NX, *S0b = hS + (size_t)b * ns, *D0 = hD + (size_t)b * ns;
+            double h = x1 ? time[b + 1] - time[b] : 0;
+            /* The input of row b is held up to row b+1, so it gives the slope there too. */
+            if (x1)
+                variational(x1, S0b + ns, u + b * NU, du + b * NU, delay_column, p, nc, column, k1,
+                            s1);
+            interpolate(NX, h, t - time[b], x0, d0, x1, k1, late_x);
+            interpolate(ns, h, t - time[b], S0b, D0, x1 ? S0b + ns : 0, s1, late_S);
             output_sensitive(late_x, late_S, u + b * NU, p, nc, column, late_y, late_J);
             y[j] = late_y[j];
             memcpy(J + j * nc, late_J + j * nc, nc * sizeof(double));
             if (delay_to[j] >= 0) {
                 /* dy/d(delay) = -C dx/dt, by a difference along the trajectory. */
-                double ahead[NX], value[NY], w[W], e = 1e-6;
-                for (int i = 0; i < NX; i++) ahead[i] = late_x[i] + e * hd[(size_t)b * NX + i];
+                double ahead[NX], late_d[NX], value[NY], w[W], e = 1e-6;
+                rates(late_x, u + b * NU, p, late_d);
+                for (int i = 0; i < NX; i++) ahead[i] = late_x[i] + e * late_d[i];
                 const double *arg[3] = {ahead, u + b * NU, p};
                 double *res[1] = {value};
                 cgm_h(arg, res, 0, w, 0);
