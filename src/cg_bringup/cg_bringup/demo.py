@@ -68,7 +68,8 @@ def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> di
     Raises:
         ExperimentError: It failed; the message ends with what it said.
     """
-    command = [sys.executable, '-m', 'cg_sysid.cli', 'diagnose']
+    program = 'import sys; from cg_sysid.diagnose_cli import main; sys.exit(main())'
+    command = [sys.executable, '-c', program]
     command += ['--model', str(nominal), '--out', str(out), *map(str, bags)]
     start = time.monotonic()
     with console.status('diagnosing'):

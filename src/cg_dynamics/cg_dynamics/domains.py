@@ -2,12 +2,14 @@
 
 import contextlib
 import fcntl
+import itertools
 import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 DOMAINS = range(2, 100)  # beyond 101, DDS ports run into those that Linux hands out
+_turn = itertools.count(os.getpid())
 
 
 @contextlib.contextmanager
@@ -17,7 +19,7 @@ def own_domain() -> Iterator[int]:
     A file lock per domain marks it as taken; the lock dies with the process.
     """
     before = os.environ.get('ROS_DOMAIN_ID')
-    first = os.getpid() % len(DOMAINS)
+    first = next(_turn)  # the domain held last is still full of ghosts
     for offset in range(len(DOMAINS)):
         domain = DOMAINS[(first + offset) % len(DOMAINS)]
         path = Path(tempfile.gettempdir()) / f'ros_domain_{domain}.lock'

@@ -124,13 +124,6 @@ class SimulationNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Publish the note, then start the clock as soon as all peers are there."""
-        others = self.count_publishers(topics.APPLIED_TORQUE) - 1
-        if others > 0:
-            self.get_logger().error(
-                f'{others} other publisher(s) of {topics.APPLIED_TORQUE} in this ROS domain; '
-                'one machine per ROS_DOMAIN_ID'
-            )
-            return TransitionCallbackReturn.FAILURE
         self.note_publisher.publish(String(data=self.note))
         self.plant = self.make_plant()
         self.gate.drop('no command yet')
@@ -189,20 +182,25 @@ class SimulationNode(LifecycleNode):
     def _gather(self, now: float) -> float:
         missing = self._missing_peers()
         if missing and now > self._deadline:
-            self._fail(f'no {missing} after {self.settings.peer_timeout:g} s')
+            self._fail(f'waited {self.settings.peer_timeout:g} s for {missing}')
         elif not missing:
             self._begin()
         return 0.005
 
     def _missing_peers(self) -> str:
+        if self.count_publishers(topics.APPLIED_TORQUE) > 1:
+            return (
+                f'the end of another machine, which publishes {topics.APPLIED_TORQUE} in this '
+                'ROS domain'
+            )
         needed = self.settings.recorders
         unheard = self.sensors.unheard(needed)
         if unheard:
-            return f'recorder on {", ".join(unheard)}'
+            return f'a recorder of {", ".join(unheard)}'
         if len(self.progress) < needed:
-            return 'recorder that says it hears everything'
+            return 'a recorder that says it hears everything'
         if self.lockstep and self.command.get_publisher_count() == 0:
-            return f'publisher of {topics.TORQUE_COMMAND}'
+            return f'a publisher of {topics.TORQUE_COMMAND}'
         return ''
 
     def _begin(self) -> None:

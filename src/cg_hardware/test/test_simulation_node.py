@@ -1,0 +1,191 @@
+"""The simulated hardware on real topics: lock-step, real time, refusals, watchdogs."""
+
+import math
+import time
+
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from lifecycle_msgs.msg import State  # noqa: E402
+from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import Imu, JointState  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from cg_dynamics.domains import own_domain  # noqa: E402
+from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
+from cg_hardware.simulation_node import SimulationNode  # noqa: E402
+
+PATIENCE = 20.0  # s; discovery on a busy machine
+
+
+@pytest.fixture
+def bench():
+    with own_domain():
+        rclpy.init()
+        bench = Bench()
+        yield bench
+        bench.close()
+        rclpy.try_shutdown()
+
+
+class Bench:
+    """A machine and a controller in one executor."""
+
+    def __init__(self):
+        self.executor = EventsExecutor()
+        self.nodes = []
+        self.controller = self.add(Node('controller'))
+        self.applied, self.measured, self.notes = [], [], []
+        self.answer = None
+        controller = self.controller
+        self.command = controller.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+        controller.create_subscription(JointState, '/applied_torque', self.applied.append, 1000)
+        controller.create_subscription(Imu, '/imu', self.on_imu, 1000)
+        controller.create_subscription(String, '/experiment', self.notes.append, LATCHED_QOS)
+
+    def add(self, node):
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def machine(self, **parameters):
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        return self.add(SimulationNode(parameter_overrides=overrides))
+
+    def on_imu(self, message):
+        self.measured.append(message)
+        if self.answer is not None:
+            self.send(self.answer(message), message.header.stamp)
+
+    def send(self, torque, stamp=None, name='hip'):
+        message = JointState(name=[name], effort=[torque])
+        if stamp is not None:
+            message.header.stamp = stamp
+        self.command.publish(message)
+
+    def until(self, condition, patience=PATIENCE):
+        deadline = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < deadline, 'condition not met in time'
+            wait = min([getattr(node, 'poll', lambda: 0.01)() for node in self.nodes] + [0.01])
+            self.executor.spin_once(timeout_sec=max(wait, 0.0))
+
+    def close(self):
+        for node in self.nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+
+
+def stamps(messages):
+    return [to_nanoseconds(message.header.stamp) for message in messages]
+
+
+def test_lockstep_answers_are_applied_at_the_stamp_they_answer(bench):
+    bench.answer = lambda message: 1.0 + 1e-9 * (to_nanoseconds(message.header.stamp) - 10**9)
+    machine = bench.machine(mode='lockstep', duration=0.1)
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 50)
+    assert stamps(bench.applied) == [10**9 + 2_000_000 * k for k in range(50)]
+    assert [m.effort[0] for m in bench.applied] == pytest.approx(
+        [1.0 + 0.002 * k for k in range(50)]
+    )
+    assert sorted(set(stamps(bench.measured))) == stamps(bench.applied)
+    assert 'compass_gait' in bench.notes[0].data
+
+
+def test_lockstep_peer_that_falls_silent_ends_the_run_with_zero_torque(bench):
+    silent = []
+    bench.answer = lambda message: 5.0
+
+    def answer_ten(message):
+        bench.measured.append(message)
+        if len(set(stamps(bench.measured))) <= 10:
+            bench.send(5.0, message.header.stamp)
+        else:
+            silent.append(message)
+
+    bench.on_imu = answer_ten
+    bench.controller.destroy_subscription(list(bench.controller.subscriptions)[1])
+    bench.controller.create_subscription(Imu, '/imu', answer_ten, 10)
+    machine = bench.machine(mode='lockstep', answer_timeout=0.3)
+    bench.until(lambda: machine.exit_status == 1 and bench.applied[-1].effort[0] == 0.0)
+    assert machine.phase == 'off'
+    assert [m.effort[0] for m in bench.applied] == [5.0] * 10 + [0.0]
+
+
+@pytest.mark.parametrize(('torque', 'applied'), [(math.nan, 0.0), (100.0, 40.0), (-55.0, -40.0)])
+def test_lockstep_bad_commands_never_reach_the_motor(bench, torque, applied):
+    bench.answer = lambda message: torque
+    machine = bench.machine(mode='lockstep', duration=0.01)
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 5)
+    assert {m.effort[0] for m in bench.applied} == {applied}
+
+
+def test_real_time_keeps_its_rate_and_stamps(bench):
+    machine = bench.machine(duration=1.0)
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 400)
+    deltas = {b - a for a, b in zip(stamps(bench.applied), stamps(bench.applied)[1:])}
+    assert deltas == {2_000_000}
+
+
+def test_real_time_torque_is_zero_again_soon_after_the_last_command(bench):
+    machine = bench.machine(stale_after=0.02)
+    bench.until(lambda: machine.phase == 'running' and bench.measured)
+    bench.answer = lambda message: 3.0
+    bench.until(lambda: any(m.effort[0] == 3.0 for m in bench.applied))
+    bench.answer = None
+    last_answer = time.monotonic()
+    bench.until(lambda: bench.applied[-1].effort[0] == 0.0)
+    assert time.monotonic() - last_answer < 0.5
+    # In the machine's own time, of which no load takes anything: at most 20 ms and one sample.
+    driven = [to_nanoseconds(m.header.stamp) for m in bench.applied if m.effort[0] == 3.0]
+    answered = stamps(bench.measured)
+    assert driven[-1] - max(s for s in answered if s <= driven[-1]) <= 22_000_000
+
+
+def test_real_time_command_for_another_joint_is_refused(bench):
+    machine = bench.machine()
+    bench.until(lambda: machine.phase == 'running' and bench.measured)
+    bench.send(3.0, to_stamp(time.time_ns()), name='knee')
+    count = len(bench.applied)
+    bench.until(lambda: len(bench.applied) > count + 50)
+    assert {m.effort[0] for m in bench.applied} == {0.0}
+
+
+def test_parameters_are_refused_with_a_reason(bench):
+    machine = bench.machine(mode='real_time')
+    (result,) = machine.set_parameters([Parameter('seed', value=5)])
+    assert not result.successful
+    assert 'seed cannot change while the node is at work' in result.reason
+    with pytest.raises(ValueError, match='mode'):
+        bench.machine(mode='sideways')
+
+
+def test_missing_model_is_refused(bench):
+    with pytest.raises(ValueError, match='could not start'):
+        bench.machine(model_file='/no/such/model.yaml')
+
+
+def test_lifecycle_by_hand_and_again(bench):
+    machine = bench.machine(autostart=False, duration=0.02, mode='lockstep')
+    bench.answer = lambda message: 1.0
+    for _ in range(2):
+        machine.trigger_configure()
+        machine.trigger_activate()
+        bench.applied.clear()
+        bench.until(lambda: len(bench.applied) == 10)
+        assert stamps(bench.applied)[0] == 10**9
+        bench.until(lambda: machine.phase == 'off')
+        machine.trigger_cleanup()
+    assert machine._state_machine.current_state[0] == State.PRIMARY_STATE_UNCONFIGURED
+
+
+def test_second_machine_in_one_domain_waits_and_gives_up(bench):
+    first = bench.machine()
+    bench.until(lambda: first.phase == 'running' and bench.measured)
+    second = bench.machine(peer_timeout=1.0)
+    bench.until(lambda: second.exit_status == 1)
+    assert second.phase == 'off'
+    assert first.phase == 'running'
