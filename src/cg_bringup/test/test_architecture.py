@@ -1,0 +1,82 @@
+"""The rooms of the house: who may import whom, where ROS may be, what the executables point to."""
+
+import ast
+import importlib
+import xml.etree.ElementTree as ElementTree
+from importlib.metadata import entry_points, version
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).resolve().parents[2]
+
+# docs/architecture.md. cg_sysid reaches cg_estimation only to replay it.
+MAY_IMPORT = {
+    'cg_description': set(),
+    'cg_dynamics': {'cg_description'},
+    'cg_estimation': {'cg_description', 'cg_dynamics'},
+    'cg_control': {'cg_description', 'cg_dynamics'},
+    'cg_hardware': {'cg_description', 'cg_dynamics'},
+    'cg_sysid': {'cg_description', 'cg_dynamics', 'cg_estimation'},
+    'cg_bringup': {
+        'cg_control', 'cg_description', 'cg_dynamics', 'cg_estimation', 'cg_hardware', 'cg_sysid',
+    },
+}  # fmt: skip
+ROS = {
+    'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
+    'std_msgs', 'std_srvs', 'trajectory_msgs',
+}  # fmt: skip
+
+
+def imports(path):
+    """Top-level names of all packages that a file imports, at any depth."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split('.')[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names.add(node.module.split('.')[0])
+    return names
+
+
+def modules(package):
+    return sorted((SRC / package / package).rglob('*.py'))
+
+
+@pytest.mark.parametrize('package', MAY_IMPORT)
+def test_imports_point_one_way(package):
+    allowed = MAY_IMPORT[package] | {package}
+    for path in modules(package):
+        foreign = {name for name in imports(path) if name.startswith('cg_')} - allowed
+        assert not foreign, f'{path.relative_to(SRC)} imports {foreign}'
+
+
+@pytest.mark.parametrize('package', MAY_IMPORT)
+def test_manifest_names_the_packages_that_are_imported(package):
+    manifest = ElementTree.parse(SRC / package / 'package.xml')
+    declared = {element.text for element in manifest.iter('exec_depend')}
+    used = set().union(*(imports(path) for path in modules(package))) & (ROS | set(MAY_IMPORT))
+    assert used - {package} <= declared
+
+
+@pytest.mark.parametrize('package', [name for name in MAY_IMPORT if name != 'cg_bringup'])
+def test_only_nodes_and_the_ros_helpers_import_ros(package):
+    for path in modules(package):
+        if not path.stem.endswith('_node') and path.stem not in {'ros', 'sensor_publishers'}:
+            assert not imports(path) & ROS, path.relative_to(SRC)
+
+
+@pytest.mark.parametrize('package', MAY_IMPORT)
+def test_built_version_is_the_one_of_package_xml(package):
+    manifest = ElementTree.parse(SRC / package / 'package.xml')
+    assert version(package) == manifest.findtext('version')
+
+
+@pytest.mark.parametrize(
+    'entry',
+    [e for e in entry_points(group='console_scripts') if e.value.split('.')[0] in MAY_IMPORT],
+    ids=lambda entry: f'{entry.value.split(".")[0]}-{entry.name}',
+)
+def test_executables_point_to_functions(entry):
+    module, _, function = entry.value.partition(':')
+    assert callable(getattr(importlib.import_module(module), function))

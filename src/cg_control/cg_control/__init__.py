@@ -1,0 +1,1 @@
+"""Balancing, trajectory optimisation, tracking, trees and transverse control."""

@@ -1,0 +1,1 @@
+"""The observer, and the filters it is compared with."""

@@ -1,0 +1,58 @@
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'cg_sysid'
+
+
+def shared(*folders):
+    """The files below these folders, each to its place under share/cg_sysid."""
+    files = [p for folder in folders for p in sorted(glob(f'{folder}/**', recursive=True))]
+    return [(f'share/{NAME}/{Path(p).parent}', [p]) for p in files if Path(p).is_file()]
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='System identification and diagnosis: excitation, recording, checks, fits, causes of what a simulation gets wrong, reports',
+    maintainer='Compass-gait maintainers',
+    maintainer_email='maintainers@compass-gait.dev',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test', 'test.*']),
+    package_data={'': ['*.c', '*.css', '*.html', '*.js', '*.yaml']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        *shared('config', 'launch', 'models', 'rviz', 'layouts', 'urdf'),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'casadi',
+        'cg_description',
+        'cg_dynamics',
+        'lz4',
+        'matplotlib',
+        'mcap',
+        'numpy',
+        'PyYAML',
+        'rich',
+        'rosbags',
+        'scipy',
+        'zstandard',
+    ],
+    extras_require={'test': ['pytest', 'pytest-timeout']},
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'excitation_node = cg_sysid.excitation_node:main',
+            'recorder_node = cg_sysid.recorder_node:main',
+            'recover = cg_sysid.recover:main',
+            'import = cg_sysid.importing:main',
+            'check = cg_sysid.check:main',
+            'identify = cg_sysid.identify_cli:main',
+            'diagnose = cg_sysid.diagnose_cli:main',
+            'report = cg_sysid.report_cli:main',
+        ],
+    },
+)
