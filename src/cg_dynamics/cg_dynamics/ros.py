@@ -164,7 +164,11 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         that are refused.
     """
     # rclpy's own handlers would shut the context down before the node can send its last torque.
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # arguments that rcl cannot parse
+        print(f'error: {error}', file=sys.stderr)
+        return 2
     stop = StopRequest()
     try:
         try:

@@ -1,0 +1,178 @@
+"""A journal cut off anywhere becomes an ordinary bag of everything before the cut."""
+
+import shutil
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.typesys import Stores, get_typestore
+
+from cg_sysid.recorder import Recording
+from cg_sysid.recover import JOURNAL_NAME, RecoveryError, main, needs_recovery, recover
+
+TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+TOPICS = {
+    '/applied_torque': JOINT_STATE,
+    '/hip_encoder': JOINT_STATE,
+    '/experiment': 'std_msgs/msg/String',
+}
+QOS = {
+    'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
+    'deadline': {'sec': 9223372036, 'nsec': 854775807},
+    'lifespan': {'sec': 9223372036, 'nsec': 854775807},
+    'liveliness': 'automatic',
+    'liveliness_lease_duration': {'sec': 9223372036, 'nsec': 854775807},
+    'avoid_ros_namespace_conventions': False,
+}  # fmt: skip
+MS = 1_000_000
+
+
+def joint_state(stamp_ns, value):
+    types = TYPESTORE.types
+    message = types[JOINT_STATE](
+        types['std_msgs/msg/Header'](
+            types['builtin_interfaces/msg/Time'](stamp_ns // 10**9, stamp_ns % 10**9), 'hip'
+        ),
+        ['hip'],
+        *(np.array([float(value)]) for _ in range(3)),
+    )
+    return bytes(TYPESTORE.serialize_cdr(message, JOINT_STATE))
+
+
+def note(text):
+    return bytes(
+        TYPESTORE.serialize_cdr(TYPESTORE.types['std_msgs/msg/String'](text), 'std_msgs/msg/String')
+    )
+
+
+def journal(path, samples=200, order=1):
+    """A recording that was never closed: 2 topics at 500 Hz, one chunk for every 10 ms."""
+    recording = Recording(path, TOPICS, by_stamp=True)
+    for topic in TOPICS:
+        recording.announce(topic, [QOS])
+    recording.write('/experiment', note('mechanism: compass_gait'), 0, 0.0)
+    for k in range(samples):
+        stamp = 10**9 + 2 * MS * k
+        for topic in ('/applied_torque', '/hip_encoder')[::order]:
+            recording.write(topic, joint_state(stamp, k), 0, 0.002 * k)
+    return recording
+
+
+def content(path):
+    with AnyReader([path]) as reader:
+        return [(c.topic, t, bytes(data)) for c, t, data in reader.messages()]
+
+
+def test_a_closed_recording_is_an_ordinary_bag(tmp_path):
+    result = journal(tmp_path / 'bag').close()
+    assert result.messages == 401
+    assert not result.damage
+    assert not needs_recovery(tmp_path / 'bag')
+    assert sorted(p.name for p in (tmp_path / 'bag').iterdir()) == ['bag.mcap', 'metadata.yaml']
+    messages = content(tmp_path / 'bag')
+    assert [t for _, t, _ in messages] == sorted(t for _, t, _ in messages)
+    assert messages[0][1] == 10**9
+    with AnyReader([tmp_path / 'bag']) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == '/hip_encoder']
+        assert connection.ext.offered_qos_profiles[0].depth == 10
+
+
+def test_the_order_of_arrival_leaves_no_trace(tmp_path):
+    for name, order in (('a', 1), ('b', -1)):
+        journal(tmp_path / name / 'bag', order=order).close()
+    first, second = (tmp_path / name / 'bag' / 'bag.mcap' for name in 'ab')
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_ordinary_readers_refuse_what_recover_reads(tmp_path):
+    journal(tmp_path / 'bag')  # killed: never closed
+    assert needs_recovery(tmp_path / 'bag')
+    with pytest.raises((ReaderError, FileNotFoundError)), AnyReader([tmp_path / 'bag']):
+        pass
+    recover(tmp_path / 'bag')
+    assert not needs_recovery(tmp_path / 'bag')
+
+
+def test_a_killed_recording_lacks_no_more_than_its_open_chunk(tmp_path):
+    journal(tmp_path / 'bag', samples=201)
+    recover(tmp_path / 'bag')
+    stamps = [t for topic, t, _ in content(tmp_path / 'bag') if topic == '/hip_encoder']
+    assert stamps == [10**9 + 2 * MS * k for k in range(len(stamps))]
+    assert 10**9 + 2 * MS * 200 - stamps[-1] <= 10 * MS
+
+
+def test_cut_anywhere_everything_before_the_cut_is_there(tmp_path):
+    journal(tmp_path / 'whole', samples=60)
+    data = (tmp_path / 'whole' / JOURNAL_NAME).read_bytes()
+    recover(tmp_path / 'whole')
+    whole = content(tmp_path / 'whole')
+    counts = []
+    for index, length in enumerate(range(200, len(data), 97)):
+        bag = tmp_path / f'cut{index}'
+        bag.mkdir()
+        (bag / JOURNAL_NAME).write_bytes(data[:length])
+        try:
+            recover(bag)
+        except RecoveryError as error:
+            assert 'no message' in str(error)
+            assert (bag / JOURNAL_NAME).is_file()
+            counts.append(0)
+            continue
+        found = content(bag)
+        assert found == [m for m in whole if m in found]
+        counts.append(len(found))
+    assert counts == sorted(counts)
+    assert counts[-1] > 0.8 * len(whole)
+
+
+def test_a_damaged_chunk_ends_the_reading_and_is_reported(tmp_path):
+    journal(tmp_path / 'bag', samples=100)
+    file = tmp_path / 'bag' / JOURNAL_NAME
+    data = bytearray(file.read_bytes())
+    data[len(data) * 3 // 4] ^= 0xFF
+    file.write_bytes(data)
+    result = recover(tmp_path / 'bag')
+    assert JOURNAL_NAME in result.damage
+    assert 0 < result.messages < 201
+
+
+def test_recovery_that_is_cut_off_can_be_repeated(tmp_path):
+    journal(tmp_path / 'bag')
+    work = tmp_path / 'bag' / '.recovering' / 'bag'
+    work.mkdir(parents=True)
+    (work / 'bag.mcap').write_bytes(b'half')
+    assert recover(tmp_path / 'bag').messages > 380
+    assert not (tmp_path / 'bag' / '.recovering').exists()
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    assert needs_recovery(tmp_path / 'bag')
+    assert recover(tmp_path / 'bag').messages > 380
+
+
+def test_a_single_file_becomes_a_bag_beside_it(tmp_path):
+    journal(tmp_path / 'bag')
+    shutil.move(tmp_path / 'bag' / JOURNAL_NAME, tmp_path / 'loose.mcap')
+    assert needs_recovery(tmp_path / 'loose.mcap')
+    assert recover(tmp_path / 'loose.mcap').path == tmp_path / 'loose'
+    assert len(content(tmp_path / 'loose')) > 380
+    assert (tmp_path / 'loose.mcap').is_file()
+
+
+def test_nothing_to_recover_is_said(tmp_path, capsys):
+    journal(tmp_path / 'bag').close()
+    assert main([str(tmp_path / 'bag')]) == 0
+    assert 'nothing to recover' in capsys.readouterr().out
+    assert main([str(tmp_path / 'absent')]) == 1
+    assert 'neither a bag directory nor' in capsys.readouterr().err
+
+
+def test_an_empty_recording_leaves_nothing(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, by_stamp=False)
+    assert recording.close().messages == 0
+    assert not (tmp_path / 'bag').exists()
+
+
+def test_recordings_are_never_overwritten(tmp_path):
+    with pytest.raises(ValueError, match='never overwritten'):
+        Recording(tmp_path, TOPICS, by_stamp=False)
