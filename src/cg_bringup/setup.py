@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='Launch files, whole-robot configurations, experiments and the demonstration of the compass-gait robot',
+    description='Configurations, experiments and demonstration of the compass-gait robot',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',

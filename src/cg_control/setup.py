@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='Control of the compass-gait robot: balancing, trajectory optimisation, TVLQR, LQR trees, transverse control',
+    description='Control of the compass-gait robot',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',

@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='The compass-gait robot as data: model files with units and sources, URDF, visual layouts',
+    description='The compass-gait robot as data',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',

@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='The model of the compass-gait robot: rigid-body dynamics, effects, impact, linearisation, compiled functions, simulation',
+    description='The model of the compass-gait robot',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',

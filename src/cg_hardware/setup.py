@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='Hardware input and output of the compass-gait robot, the simulated machine that stands in for it, and the safety gate on the torque path',
+    description='Hardware of the compass-gait robot, real and simulated',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',
@@ -28,6 +28,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=[
+        'cg_description',
         'cg_dynamics',
         'numpy',
         'PyYAML',

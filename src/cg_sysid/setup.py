@@ -15,7 +15,7 @@ def shared(*folders):
 setup(
     name=NAME,
     version='0.1.0',
-    description='System identification and diagnosis: excitation, recording, checks, fits, causes of what a simulation gets wrong, reports',
+    description='System identification and diagnosis of the compass-gait robot',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',

@@ -1,4 +1,4 @@
-"""The scripts of the workspace: what they refuse, they refuse in one sentence and with exit code 1."""
+"""The scripts of the workspace: what they refuse, they refuse in one sentence and exit with 1."""
 
 import os
 import shutil
@@ -42,6 +42,12 @@ def stand_in(folder, name, text):
     return f'{path.parent}{os.pathsep}{os.environ["PATH"]}'
 
 
+def python_without(folder, word):
+    """A python3 that fails at any command that has this word in it."""
+    stand_in(folder, 'python3', f'case "$*" in *{word}*) exit 1; esac; exec {sys.executable} "$@"')
+    return str(folder / 'bin' / 'python3')
+
+
 def assert_refused(result, *words):
     assert result.returncode == 1
     assert result.stdout == ''
@@ -72,14 +78,14 @@ def test_setup_refuses_a_python_that_is_not_there(bare):
 
 
 def test_setup_refuses_a_python_without_venv(bare):
-    stand_in(bare, 'python3', f'case "$*" in *ensurepip*) exit 1; esac; exec {sys.executable} "$@"')
-    result = run('tools/setup.sh', root=bare, PYTHON=str(bare / 'bin/python3'), ROS_DISTRO=None)
+    python = python_without(bare, 'ensurepip')
+    result = run('tools/setup.sh', root=bare, PYTHON=python, ROS_DISTRO=None)
     assert_refused(result, 'python3-venv')
 
 
 def test_setup_refuses_jazzy_without_rclpy(bare):
-    stand_in(bare, 'python3', f'case "$*" in *rclpy*) exit 1; esac; exec {sys.executable} "$@"')
-    result = run('tools/setup.sh', root=bare, PYTHON=str(bare / 'bin/python3'), ROS_DISTRO='jazzy')
+    python = python_without(bare, 'rclpy')
+    result = run('tools/setup.sh', root=bare, PYTHON=python, ROS_DISTRO='jazzy')
     assert_refused(result, 'rclpy', 'setup.bash')
 
 
