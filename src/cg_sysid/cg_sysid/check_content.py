@@ -2,15 +2,15 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
 
-from cg_sysid.bags import RawRecording
 from cg_sysid.channels import APPLIED_TORQUE, TORQUE_COMMAND, mechanism
 from cg_sysid.check_signals import Signal
 from cg_sysid.findings import Finding
+from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
 
 WANTED = (
@@ -25,8 +25,8 @@ LITTLE_MOTION = 10.0  # motion over the noise floor below which there is none, [
 SLOPE_S = 0.03  # rates for the coverage are slopes over this span, in s
 WELL_COVERED = 0.5  # share of the region of use that the data should cover, [1]
 FEEDBACK = 0.9  # share of the torque's variance that angles and rates explain, [1]
-NARROW_BAND = 0.8  # share of the torque's power in few lines: a sine proves no feedback, [1]
-LINES = 6  # number of such lines
+NARROW_BAND = 0.8  # share of the torque's power in one line: a sine proves no feedback, [1]
+LINE = 4  # bins of the spectrum that one line spreads over
 
 
 def check_content(
@@ -102,12 +102,12 @@ def _instant(value: object) -> float | None:
     """Seconds since 1970 of an ISO 8601 time, None if it is none."""
     if isinstance(value, str):
         try:
-            value = datetime.fromisoformat(value)
+            value = datetime.fromisoformat(value.replace('Z', '+00:00'))
         except ValueError:
             return None
     if not isinstance(value, datetime):
         return None
-    return (value if value.tzinfo else value.replace(tzinfo=UTC)).timestamp()
+    return (value if value.tzinfo else value.replace(tzinfo=timezone.utc)).timestamp()
 
 
 def _model(raw: RawRecording, model: Path) -> Iterator[Finding]:
@@ -136,8 +136,7 @@ def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
         spread += abs(curvature) * START_S
         begins[name] = (float(np.mean(signal.values[early])), slope, spread)
     moving = [n for n, (_, v, s) in begins.items() if abs(v) > REST_RATE + s]
-    if raw.note.get('initial_state') == 'rest' and moving:
-        name = moving[0]
+    for name in moving if raw.note.get('initial_state') == 'rest' else ():
         rate = begins[name][1]
         yield Finding('not_at_rest', 'warning', name, f'the note says that the motion starts from '
                       f'rest, but this moves at {rate:.3g} rad/s', 0.0, START_S, 0, rate,
@@ -189,8 +188,8 @@ def _coverage(
                           'model will be used', value=share, allowed=WELL_COVERED)
     known = mechanism(raw.mechanism)
     angles = [signals[n] for n in known.output_names if n in signals and n.endswith('angle')]
-    still = [s for s in angles if np.ptp(s.values) < LITTLE_MOTION * max(s.noise.sigma_floor, 1e-6)]
-    if angles and len(still) == len(angles):
+    moved = [np.ptp(s.values) > LITTLE_MOTION * max(s.noise.sigma_floor, 1e-6) for s in angles]
+    if angles and not any(moved):
         yield Finding('no_motion', 'warning', '', 'nothing moves: no parameter of motion can be '
                       'identified from this recording')
 
@@ -237,7 +236,7 @@ def _closed_loop(
             continue
         torque = signals[name]
         power = np.sort(_spectrum(torque)[1])[::-1]
-        if power[: 3 * LINES].sum() > NARROW_BAND * power.sum():
+        if power[:LINE].sum() > NARROW_BAND * power.sum():
             continue
         columns = [np.ones(len(torque.time))]
         for other, signal in signals.items():

@@ -6,23 +6,27 @@ joint still are normal.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cg_sysid.bags import RawRecording
 from cg_sysid.channels import mechanism
 from cg_sysid.findings import Finding
 from cg_sysid.noise import ChannelNoise, channel_noise
+from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
 
 FROZEN_SAMPLES = 15  # shortest run of one value that is looked at
-ABRUPT = 4.0  # a motion this many quanta or sigmas per sample cannot stop in one sample, [1]
+ABRUPT = 1.5  # steps this many quanta or sigmas long are motion, [1]
+ACCELERATING = 7.5  # samples in which a motion of the usual acceleration comes to a stop, [1]
+NOISY_SPAN = 20  # samples beside a run in which noise is looked for
 RELEASE = 6.0  # a jump this many usual steps long ends a freeze, [1]
 SPIKE = 10.0  # error of interpolation over its local size, [1]
 SHIFT = 8.0  # step over the noise of a step and over the change of slope around it, [1]
 SHIFT_QUANTA = 4.0  # step over the resolution, [1]
 MANY_SPIKES = 0.01  # share of samples, [1]
+STILL_S = 1.0  # a sensor may be still this long while others move, in s
+STILL_SHARE = 0.2  # and for this share of the recording, [1]
 SATURATED_RUN = 5  # samples at the limit in a row
 SATURATED_SHARE = 0.01  # share of samples at the limit, [1]
 
@@ -80,13 +84,58 @@ def check_signals(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Fin
     yield from _not_finite(raw)
     for name in known.output_names:
         if name in signals:
-            frozen = list(_frozen(signals[name]))
-            yield from frozen
-            yield from _spikes(signals[name])
-            yield from _shifts(signals[name], frozen)
+            yield from _check_output(signals[name])
+    yield from _still(signals, known.output_names)
     for name in known.input_names:
         if name in signals:
             yield from _saturation(signals[name])
+
+
+def _check_output(signal: Signal) -> Iterator[Finding]:
+    """Spikes first; the other checks see the signal without them."""
+    spikes = find_spikes(signal)
+    yield from _spikes(signal, spikes)
+    signal = _without(signal, spikes)
+    frozen = list(_frozen(signal))
+    yield from frozen
+    yield from _shifts(signal, frozen)
+
+
+def _without(signal: Signal, samples: np.ndarray) -> Signal:
+    """The signal with some samples replaced by the line between their neighbours."""
+    keep = np.setdiff1d(np.arange(len(signal.values)), samples)
+    values = np.interp(signal.time, signal.time[keep], signal.values[keep])
+    return replace(signal, values=np.where(np.isin(np.arange(len(values)), samples), values,
+                                           signal.values))
+
+
+def _still(signals: dict[str, Signal], names: tuple[str, ...]) -> Iterator[Finding]:
+    """A sensor that has moved before and rests for long while another one moves as usual.
+
+    Friction can do that too, so that this is a warning.
+    """
+    for name in names:
+        if name not in signals or not np.ptp(signals[name].values):
+            continue
+        signal = signals[name]
+        runs = constant_runs(signal.values, FROZEN_SAMPLES)
+        if not runs:
+            continue
+        first, last = max(runs, key=lambda run: run[1] - run[0])
+        start, stop = float(signal.time[first]), float(signal.time[last])
+        if stop - start < max(STILL_S, STILL_SHARE * float(np.ptp(signal.time))):
+            continue
+        for other in names:
+            if other == name or other not in signals:
+                continue
+            near = (signals[other].time > start) & (signals[other].time < stop)
+            if near.sum() > 10 and np.std(signals[other].values[near]) > 0.5 * np.std(
+                signals[other].values
+            ) > 5.0 * signals[other].noise.sigma_floor:
+                yield Finding('still', 'warning', name, f'does not change for {stop - start:.2f} '
+                              f's while {other} moves as before', start, stop,
+                              int(signal.sample[first]), stop - start, STILL_S)
+                break
 
 
 def _not_finite(raw: RawRecording) -> Iterator[Finding]:
@@ -125,19 +174,23 @@ def _frozen(signal: Signal) -> Iterator[Finding]:
     unit = max(noise.quantum, noise.sigma, 1e-9 * np.ptp(values))
     steps = np.abs(np.diff(values))
     usual = max(float(np.quantile(steps, 0.98)), unit)
+    abrupt = ABRUPT * unit + ACCELERATING * _usual_bend(values)
     clipped: list[tuple[int, int]] = []
     stuck: list[tuple[int, int]] = []
     for first, last in runs:
         entry, leave = _speed(values[max(0, first - 5): first + 1]), _speed(values[last:last + 6])
         release = steps[last] if last < len(steps) else 0.0
-        abrupt_in, abrupt_out = entry > ABRUPT * unit, leave > ABRUPT * unit
+        abrupt_in, abrupt_out = entry > abrupt, leave > abrupt
         at_limit = values[first] in (values.max(), values.min())
-        silent = noise.sigma > noise.quantum and noise.sigma > 0.0
-        if release > RELEASE * usual or silent or (abrupt_in and not at_limit):
-            stuck.append((first, last))
-        elif at_limit and abrupt_in and abrupt_out:
+        silent = noise.sigma > noise.quantum and (
+            _is_noisy(values[max(0, first - NOISY_SPAN): first])
+            or _is_noisy(values[last + 1: last + 1 + NOISY_SPAN])
+        )
+        if at_limit and abrupt_in and abrupt_out and release <= RELEASE * usual:
             clipped.append((first, last))
-        elif abrupt_in and last == len(values) - 1:
+        elif release > RELEASE * usual or silent:
+            stuck.append((first, last))
+        elif abrupt_in and (abrupt_out or last == len(values) - 1):
             stuck.append((first, last))
     for code, runs_found, text in (
         ('stuck', stuck, 'does not change for {0:.2f} s in all while it should'),
@@ -151,6 +204,22 @@ def _frozen(signal: Signal) -> Iterator[Finding]:
             yield Finding(code, 'error', signal.channel, text.format(length, values[at]),
                           float(spans[longest][0]), float(spans[longest][1]),
                           int(signal.sample[at]), float(length), 0.0)
+
+
+def _usual_bend(values: np.ndarray) -> float:
+    """Usual change of the step from one sample to the next, in the unit of the values."""
+    stride = 5
+    if len(values) <= 2 * stride:
+        return 0.0
+    bend = values[2 * stride:] - 2.0 * values[stride:-stride] + values[:-2 * stride]
+    return float(np.quantile(np.abs(bend), 0.95)) / stride**2
+
+
+def _is_noisy(values: np.ndarray) -> bool:
+    """Whether a short run goes up and down as white noise does and motion does not."""
+    signs = np.sign(np.diff(values))
+    # The steps of white noise turn round two times out of three.
+    return len(signs) >= 8 and float(np.mean(signs[1:] * signs[:-1] < 0.0)) > 0.4
 
 
 def _speed(values: np.ndarray) -> float:
@@ -173,37 +242,40 @@ def _interpolation_error(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     return samples[:, 2] - predicted
 
 
-def _spikes(signal: Signal) -> Iterator[Finding]:
-    """Single samples that fit nothing around them."""
+def find_spikes(signal: Signal) -> np.ndarray:
+    """Indices of single samples that fit nothing around them, shape (K,)."""
     time, values = signal.time, signal.values
     if len(values) < 40:
-        return
-    error = _interpolation_error(time, values)
-    size = np.abs(error)
-    # The median over the neighbourhood, without the spike and the four errors that it causes.
+        return np.array([], dtype=int)
+    size = np.abs(_interpolation_error(time, values))
+    # A quantile over the neighbourhood forgets the spike and the four errors that it causes.
     reach = 12
     padded = np.pad(size, reach, mode='reflect')
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
-    local = np.quantile(around, 0.8, axis=1)
+    local = np.quantile(around, 0.75, axis=1)
     limit = SPIKE * np.maximum(local, signal.noise.sigma) + 3.0 * signal.noise.quantum
     limit += 1e-9 * np.ptp(values)
-    centre = np.abs(error)
-    peak = np.ones(len(centre), dtype=bool)
-    peak[1:] &= centre[1:] > centre[:-1]
-    peak[:-1] &= centre[:-1] >= centre[1:]
-    hits = np.flatnonzero((centre > limit) & peak)
-    # Back where it was: a step that lasts is a shift.
-    before, after = values[hits + 1], values[hits + 3]
-    hits = hits[np.abs(after - before) < 0.5 * np.abs(values[hits + 2] - 0.5 * (before + after))]
-    if not len(hits):
+    peak = np.ones(len(size), dtype=bool)
+    peak[1:] &= size[1:] > size[:-1]
+    peak[:-1] &= size[:-1] >= size[1:]
+    hits = np.flatnonzero((size > limit) & peak) + 2
+    # A step that lasts is a shift: a spike is back where it was.
+    before, after = values[hits - 1], values[hits + 1]
+    return hits[np.abs(after - before) < 0.5 * np.abs(values[hits] - 0.5 * (before + after))]
+
+
+def _spikes(signal: Signal, spikes: np.ndarray) -> Iterator[Finding]:
+    if not len(spikes):
         return
-    worst = int(hits[np.argmax(centre[hits])])
-    share = len(hits) / len(values)
+    values, time = signal.values, signal.time
+    height = values[spikes] - 0.5 * (values[spikes - 1] + values[spikes + 1])
+    worst = int(np.argmax(np.abs(height)))
+    at = float(time[spikes[worst]])
     yield Finding(
-        'spikes', 'error' if share > MANY_SPIKES else 'warning', signal.channel,
-        f'{len(hits)} sample(s) far from their neighbours, the worst by {error[worst]:.3g}',
-        float(time[worst + 2]), float(time[worst + 2]), int(signal.sample[worst + 2]),
-        float(error[worst]), float(limit[worst]))
+        'spikes', 'error' if len(spikes) > MANY_SPIKES * len(values) else 'warning',
+        signal.channel,
+        f'{len(spikes)} sample(s) far from their neighbours, the worst by {height[worst]:.3g}',
+        at, at, int(signal.sample[spikes[worst]]), float(height[worst]))
 
 
 def _shifts(signal: Signal, frozen: list[Finding]) -> Iterator[Finding]:

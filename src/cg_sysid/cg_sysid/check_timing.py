@@ -4,12 +4,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cg_sysid.bags import RawRecording, RawTopic
 from cg_sysid.channels import NOTE_TOPIC, TORQUE_COMMAND, mechanism
 from cg_sysid.findings import Finding
+from cg_sysid.raw import RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S
 
 GAP = 2.5  # a spacing this many times the usual one lacks samples, [1]
+GAP_REGULAR = 1.6  # the same where the stamps are regular, [1]
+REGULAR_SPREAD = 1.25  # regular: 95 % of the spacings are below this times the median, [1]
 LONG_GAP_S = 0.1  # a torque that changed over a gap this long is not known, in s
 LOST_SHARE = 0.2  # share of lost samples that makes a topic useless, [1]
 RATE_TOLERANCE = 0.05  # of the nominal rate, [1]
@@ -84,7 +86,7 @@ def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
     if len(backward):
         k = int(backward[0]) + 1
         spacing = np.diff(np.unique(stamp))
-        harmless = spacing.min(initial=0) >= REGULAR * np.median(spacing)
+        harmless = len(spacing) > 0 and spacing.min() >= REGULAR * np.median(spacing)
         yield Finding(
             'time_backwards', 'warning' if harmless else 'error', topic.name,
             f'stamps run backwards {len(backward)} time(s), first by {-step[k - 1] / 1e6:.3g} ms'
@@ -150,7 +152,9 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
     if not len(positive):
         return
     usual = float(np.median(positive))
-    gaps = np.flatnonzero(spacing > GAP * usual)
+    regular = np.quantile(positive, 0.95) < REGULAR_SPREAD * usual
+    limit = (GAP_REGULAR if regular else GAP) * usual
+    gaps = np.flatnonzero(spacing > limit)
     if not len(gaps):
         return
     lost = int(np.sum(np.rint(spacing[gaps] / usual) - 1))
@@ -170,7 +174,7 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
         f'{1e3 * length:.1f} ms instead of {usual / 1e6:.3g} ms'
         + ('; the torque in between is not known' if unknown else ''),
         _seconds(stamp[worst], origin), _seconds(stamp[worst + 1], origin),
-        int(order[worst]), length, GAP * usual / NS_PER_S)
+        int(order[worst]), length, limit / NS_PER_S)
 
 
 def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]:

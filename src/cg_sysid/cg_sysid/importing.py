@@ -11,18 +11,19 @@ import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from cg_dynamics.rig import Setup
 
+from cg_dynamics.rig import Setup
 from cg_sysid import channels
-from cg_sysid.bags import NOTE_FORMAT, write_bag
+from cg_sysid.bag_writer import write_bag
 from cg_sysid.errors import RecordingError
 from cg_sysid.expressions import column, evaluate
+from cg_sysid.raw import NOTE_FORMAT
 from cg_sysid.record import NS_PER_S, Record
 from cg_sysid.tables import Table, read_table
 
@@ -258,15 +259,15 @@ def _start(start: Any, path: Path) -> int:
     """Stamp of time 0 in ns: ISO 8601, or `{from_name: '%Y...'}` for a file named by its time."""
     try:
         if isinstance(start, dict):
-            instant = datetime.strptime(path.stem, start['from_name']).replace(tzinfo=UTC)
+            instant = datetime.strptime(path.stem, start['from_name']).replace(tzinfo=timezone.utc)
         elif isinstance(start, datetime):
             instant = start
         else:
-            instant = datetime.fromisoformat(start)
-    except (KeyError, TypeError, ValueError) as error:
+            instant = datetime.fromisoformat(start.replace('Z', '+00:00'))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RecordingError(f'{path}: start {start!r} cannot be read: {error}') from None
     if instant.tzinfo is None:
-        instant = instant.replace(tzinfo=UTC)
+        instant = instant.replace(tzinfo=timezone.utc)
     return int(instant.timestamp()) * NS_PER_S
 
 
@@ -334,7 +335,7 @@ def main(argv: list[str] | None = None) -> int:
             path = Path(args.out) / imported.record.name
             write_bag(path, replace(imported.record, source=''), imported.commands)
             print(f'{path}: {len(imported.record)} rows, {imported.record.duration:.2f} s')
-    except RecordingError as error:
+    except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
     return 0

@@ -82,6 +82,7 @@ def white_sigma(time: np.ndarray, values: np.ndarray) -> float:
     """
     if len(values) < max(WIDTHS):
         return 0.0
+    values = values - values[0]  # so that a constant has no rounding either
     return min(_blockwise(contrasts(time, values, width)) for width in WIDTHS)
 
 
@@ -127,10 +128,20 @@ def resolution(values: np.ndarray) -> float:
     spacing = spacing[spacing > SAME_VALUE * (levels[-1] - levels[0])]
     if len(spacing) < 2:
         return float(spacing.max(initial=0.0))
-    quantum = float(spacing.min())
-    near = spacing[spacing < 1.5 * quantum]
-    quantum = float(np.mean(near))
-    multiples = spacing / quantum
+    # The smallest spacing is the quantum unless a value off the grid (a limit, say) made it.
+    lengths = np.quantile(spacing, [0.0, 0.1, 0.5], method='nearest')
+    candidates = [_mean_near(spacing, float(q)) for q in lengths]
+    return max((q for q in candidates if _is_quantum(q, spacing)), default=0.0)
+
+
+def _mean_near(spacing: np.ndarray, candidate: float) -> float:
+    """Mean of the spacings that are about as long as a candidate."""
+    return float(np.mean(spacing[np.abs(spacing / candidate - 1.0) < 0.25]))
+
+
+def _is_quantum(candidate: float, spacing: np.ndarray) -> bool:
+    """Whether nearly every spacing is a whole number of a candidate."""
+    multiples = spacing / candidate
     whole = np.abs(multiples - np.rint(multiples)) < WHOLE_MULTIPLE
     # Continuous values have a chance of 2 x WHOLE_MULTIPLE each to look whole.
-    return quantum if np.mean(whole) >= WHOLE_SHARE else 0.0
+    return bool(np.mean(whole & (multiples > 0.5)) >= WHOLE_SHARE)

@@ -6,11 +6,12 @@ once, here, and trusted afterwards. Its arrays are read-only.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from cg_dynamics.rig import Setup
 
+from cg_dynamics.rig import Setup
 from cg_sysid import channels
 from cg_sysid.errors import RecordingError
 
@@ -166,7 +167,7 @@ class Record:
         grace = 0.5 * float(np.median(self.dt))
         count = int((self.duration + float(np.median(self.dt)) + grace) / length_s)
         edges = np.arange(count + 1) * length_s - grace
-        return [self.slice(max(a, 0.0), b) for a, b in zip(edges, edges[1:], strict=False)]
+        return [self.slice(max(a, 0.0), b) for a, b in pairwise(edges)]
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from cg_sysid.bags import NOTE_FORMAT, RawRecording, RawTopic
 from cg_sysid.channels import Mechanism, Topic, mechanism
+from cg_sysid.raw import NOTE_FORMAT, RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S
 
 START_NS = 1_300_000_000 * NS_PER_S

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.io
+from scipy.io.matlab import MatReadError
 
 from cg_sysid.errors import RecordingError
 
@@ -64,7 +65,7 @@ def _read_csv(path: Path) -> Table:
 def _read_mat(path: Path) -> Table:
     try:
         content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
-    except (ValueError, NotImplementedError, TypeError) as error:
+    except (ValueError, NotImplementedError, TypeError, MatReadError) as error:
         raise RecordingError(f'{path}: not a readable MAT file: {error}') from None
     columns: Table = {}
     for name, value in content.items():

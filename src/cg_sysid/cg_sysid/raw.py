@@ -1,0 +1,72 @@
+"""Raw recordings: every sample as it stands in the file, nothing repaired."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cg_dynamics.rig import Setup
+from cg_sysid.errors import RecordingError
+
+NOTE_FORMAT = 'cg_recording/1'
+
+
+@dataclass(frozen=True)
+class RawTopic:
+    """The samples of one topic in the order in which they were recorded, nothing repaired.
+
+    Attributes:
+        name: Topic name.
+        msgtype: Message type.
+        stamp_ns: Header stamps in ns, shape (M,), int64.
+        log_ns: Times at which the recorder received them in ns, shape (M,), int64.
+        values: Channel -> values, shape (M,), NaN where the message holds NaN.
+        absent: Channel -> whether the message declares the value absent, shape (M,).
+    """
+
+    name: str
+    msgtype: str
+    stamp_ns: np.ndarray
+    log_ns: np.ndarray
+    values: dict[str, np.ndarray]
+    absent: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
+@dataclass(frozen=True)
+class RawRecording:
+    """A recording as it stands in the file.
+
+    Attributes:
+        path: Where it was read from.
+        note: The recording note, as read.
+        mechanism: Name of the mechanism.
+        topics: Topic name -> samples, of the topics that the mechanism knows.
+        others: Names of the topics that the analysis does not use, with their message types.
+    """
+
+    path: str
+    note: dict[str, Any]
+    mechanism: str
+    topics: dict[str, RawTopic]
+    others: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Short name of the recording."""
+        return Path(self.path).name
+
+    @property
+    def setup(self) -> Setup:
+        """What was done to the rig.
+
+        Raises:
+            RecordingError: The note's set-up is malformed.
+        """
+        try:
+            return Setup.from_dict(self.note.get('setup') or {})
+        except ValueError as error:
+            raise RecordingError(f'{self.path}: note: {error}') from None

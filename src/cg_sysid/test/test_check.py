@@ -1,0 +1,251 @@
+"""Checks: healthy recordings pass, each fault is found where it was put."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from cg_sysid import bags, check
+from cg_sysid.check import check_recording
+from cg_sysid.synthetic import Synthesis, synthesise
+
+SAMPLES = 4000  # 8 s at 500 Hz
+SEEDS = range(3)
+
+HEALTHY = {
+    'plain': {},
+    'free motion': {'torque': 'zero'},
+    'chirp': {'torque': 'chirp'},
+    'steps': {'torque': 'steps'},
+    'sine': {'torque': 'sine'},
+    'coarse encoder': {'quantum': 2 * np.pi / 512},
+    'coarse encoder, slow': {'quantum': 2 * np.pi / 512, 'amplitude': 0.01},
+    'hardly moving': {'amplitude': 1e-3},
+    'noisy encoder': {'noise': 1e-3, 'quantum': 0.0},
+    'jitter': {'jitter': 0.8},
+    'rest first': {'rest_share': 0.7},
+    'ideal sensor, rest first': {'rest_share': 0.5, 'quantum': 0.0},
+    'fast': {'bandwidth': 15.0, 'amplitude': 0.1},
+    'slow': {'bandwidth': 0.3},
+    'pendulum': {'mechanism': 'pendulum', 'quantum': 0.0, 'rate': 100.0, 'amplitude': 2.0},
+    'double pendulum': {'mechanism': 'double_pendulum', 'bandwidth': 8.0, 'jitter': 0.5},
+}
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+@pytest.mark.parametrize('case', HEALTHY)
+def test_healthy_recordings_pass(case, seed):
+    report = check_recording(synthesise(Synthesis(**HEALTHY[case]), seed))
+    codes = {finding.code for finding in report.findings if finding.severity != 'info'}
+    assert codes <= {'poor_start'}  # some of them do start at rest and upright
+
+
+def edit(raw, topic, **changes):
+    """The recording with other arrays in one topic."""
+    return replace(raw, topics={**raw.topics, topic: replace(raw.topics[topic], **changes)})
+
+
+def with_values(raw, topic, channel, change):
+    """The recording with one channel's values changed by a function."""
+    values = raw.topics[topic].values
+    return edit(raw, topic, values={**values, channel: change(values[channel].copy())})
+
+
+def with_samples(raw, topic, index):
+    """The recording with only the given samples of one topic, in the given order."""
+    old = raw.topics[topic]
+    return edit(
+        raw, topic, stamp_ns=old.stamp_ns[index], log_ns=old.log_ns[index],
+        values={c: v[index] for c, v in old.values.items()},
+        absent={c: v[index] for c, v in old.absent.items()},
+    )
+
+
+def with_stamps(raw, topic, shift_ns):
+    """The recording with the stamps of one topic moved."""
+    return edit(raw, topic, stamp_ns=raw.topics[topic].stamp_ns + shift_ns)
+
+
+def without(raw, topic):
+    return replace(raw, topics={k: v for k, v in raw.topics.items() if k != topic})
+
+
+def hip(change):
+    return lambda raw: with_values(raw, '/hip_encoder', 'hip_angle', change)
+
+
+def imu_angle(change):
+    return lambda raw: with_values(raw, '/imu', 'imu_angle', change)
+
+
+def imu_rate(change):
+    return lambda raw: with_values(raw, '/imu', 'imu_rate', change)
+
+
+def frozen(first, last):
+    def change(values):
+        values[first:last] = values[first]
+        return values
+    return change
+
+
+def assigned(index, value):
+    def change(values):
+        values[index] += value
+        return values
+    return change
+
+
+INDEX = np.arange(SAMPLES)
+HOLE = np.delete(INDEX, slice(2000, 2150))  # 0.3 s
+SWAPPED = np.r_[0:1000, 1001, 1000, 1002:SAMPLES]
+SPIKED = np.array([300, 900, 1500, 2222, 3333])
+
+# name: (fault, code, channel or topic, verdict, place in s or None)
+FAULTS = {
+    'NaN': (hip(assigned(1000, np.nan)), 'not_finite', 'hip_angle', 'unusable', 2.0),
+    'hip stuck': (hip(frozen(2000, 2250)), 'stuck', 'hip_angle', 'unusable', 4.0),
+    'imu stuck': (imu_angle(frozen(2000, 2250)), 'stuck', 'imu_angle', 'unusable', 4.0),
+    'gyro stuck': (imu_rate(frozen(2000, 2250)), 'stuck', 'imu_rate', 'unusable', 4.0),
+    'hip shift': (hip(lambda v: v + 0.02 * (INDEX > 2500)), 'zero_shift', 'hip_angle',
+                  'unusable', 5.0),
+    'imu shift': (imu_angle(lambda v: v + 0.02 * (INDEX > 2500)), 'zero_shift', 'imu_angle',
+                  'unusable', 5.0),
+    'hip clipped': (hip(lambda v: np.clip(v, -0.15, 0.15)), 'clipped', 'hip_angle', 'unusable',
+                    None),
+    'gyro sign': (imu_rate(lambda v: -v), 'sign', 'imu_rate', 'unusable', None),
+    'gyro in degrees': (imu_rate(lambda v: 57.3 * v), 'unit', 'imu_rate', 'unusable', None),
+    'gyro scale': (imu_rate(lambda v: 1.5 * v), 'scale', 'imu_rate', 'warnings', None),
+    'spikes': (hip(assigned(SPIKED, 0.05)), 'spikes', 'hip_angle', 'warnings', None),
+    'imu spike': (imu_angle(assigned(1234, 1.0)), 'spikes', 'imu_angle', 'warnings', 2.468),
+    'samples lost': (lambda r: with_samples(r, '/hip_encoder', np.delete(INDEX, SPIKED)), 'gap',
+                     '/hip_encoder', 'warnings', None),
+    'sensor hole': (lambda r: with_samples(r, '/hip_encoder', HOLE), 'gap', '/hip_encoder',
+                    'warnings', 4.0),
+    'torque hole': (lambda r: with_samples(r, '/applied_torque', HOLE), 'gap', '/applied_torque',
+                    'unusable', 4.0),
+    'duplicates': (lambda r: with_samples(r, '/imu', np.sort(np.r_[INDEX, 500:510])),
+                   'duplicates', '/imu', 'warnings', 1.0),
+    'clock back': (lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, -50_000_000, 0)),
+                   'time_backwards', '/imu', 'unusable', 4.0),
+    'clock ahead': (lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, 80_000_000, 0)),
+                    'clock_jump', '/imu', 'unusable', 4.0),
+    'overtaking': (lambda r: with_samples(r, '/imu', SWAPPED), 'time_backwards', '/imu',
+                   'warnings', 2.0),
+    'rate changed': (lambda r: with_samples(r, '/hip_encoder', np.r_[0:2000, 2000:SAMPLES:2]),
+                     'rate_change', '/hip_encoder', 'warnings', 4.0),
+    'rate halved': (lambda r: with_samples(r, '/hip_encoder', INDEX[::2]), 'rate',
+                    '/hip_encoder', 'warnings', None),
+    'late start': (lambda r: with_samples(r, '/imu', INDEX[1000:]), 'starts_late', '/imu',
+                   'warnings', 0.0),
+    'no overlap': (lambda r: with_stamps(r, '/imu', 10**11), 'no_overlap', '/imu', 'unusable',
+                   None),
+    'saturated torque': (
+        lambda r: with_values(r, '/applied_torque', 'hip_torque', lambda v: np.clip(v, -4, 4)),
+        'saturation', 'hip_torque', 'warnings', None),
+    'no torque': (lambda r: without(r, '/applied_torque'), 'topic_missing', '/applied_torque',
+                  'unusable', None),
+    'no encoder': (lambda r: without(r, '/hip_encoder'), 'topic_missing', '/hip_encoder',
+                   'warnings', None),
+    'one sample': (lambda r: with_samples(r, '/imu', INDEX[:1]), 'too_few_samples', '/imu',
+                   'unusable', None),
+    'stale zeros': (lambda r: replace(r, note={**r.note, 'zeroed_at': '2010-03-13T07:00:00Z'}),
+                    'zeroing_stale', '', 'warnings', None),
+    'zeros unknown': (lambda r: replace(r, note={**r.note, 'zeroed_at': 'this morning'}),
+                      'zeroing_unknown', '', 'warnings', None),
+    'no set-up': (lambda r: replace(r, note={'mechanism': r.mechanism}), 'metadata_missing', '',
+                  'warnings', None),
+    'wrong set-up': (lambda r: replace(r, note={**r.note, 'setup': {'stance': 'left'}}),
+                     'setup_wrong', '', 'unusable', None),
+    'not at rest': (lambda r: replace(
+        with_values(r, '/hip_encoder', 'hip_angle', lambda v: v + INDEX * 8e-3),
+        note={**r.note, 'initial_state': 'rest'}), 'not_at_rest', 'hip_angle', 'warnings', 0.0),
+}
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+@pytest.mark.parametrize('fault', FAULTS)
+def test_each_fault_is_found_in_its_place(fault, seed):
+    change, code, where, verdict, place = FAULTS[fault]
+    report = check_recording(change(synthesise(Synthesis(), seed)))
+    found = [finding for finding in report.of(code) if finding.where == where]
+    assert found, [f.code for f in report.findings]
+    assert report.verdict == verdict
+    if place is not None:
+        assert found[0].start_s == pytest.approx(place, abs=0.06)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_a_sensor_that_dies_is_at_least_doubted(seed):
+    raw = hip(frozen(2000, SAMPLES))(synthesise(Synthesis(), seed))
+    report = check_recording(raw)
+    assert [f for f in report.of('stuck') + report.of('still') if f.where == 'hip_angle']
+    assert report.verdict != 'good'
+
+
+def test_feedback_is_seen_in_most_cases():
+    def with_feedback(raw):
+        angle = raw.topics['/hip_encoder'].values['hip_angle']
+        lean = raw.topics['/imu'].values['imu_angle']
+        return with_values(raw, '/applied_torque', 'hip_torque',
+                           lambda v: -50.0 * angle - 5.0 * lean + 0.1 * v)
+
+    reports = [check_recording(with_feedback(synthesise(Synthesis(), s))) for s in range(10)]
+    assert sum(bool(report.of('closed_loop')) for report in reports) >= 8
+
+
+def test_the_region_of_use_is_compared_with_the_data():
+    raw = synthesise(Synthesis(amplitude=0.1), 0)
+    report = check_recording(raw, use_region={
+        'hip_angle': (-0.1, 0.1), 'hip_angle_rate': (-40.0, 40.0), 'knee': (0.0, 1.0),
+    })
+    assert [f.where for f in report.of('coverage_poor')] == ['hip_angle_rate']
+    assert [f.where for f in report.of('coverage_unknown')] == ['knee']
+
+
+def test_nothing_that_reading_refuses_is_called_usable():
+    raw = synthesise(Synthesis(), 0)
+    for fault in (change for change, *_ in FAULTS.values()):
+        broken = fault(raw)
+        if check_recording(broken).verdict != 'unusable':
+            bags.to_record(broken)
+
+
+def bag(tmp_path, seed=0, name='bag'):
+    record = bags.to_record(synthesise(Synthesis(duration=2.0), seed))
+    return bags.write_bag(tmp_path / name, record)
+
+
+def test_the_command_line_prints_text_and_json(tmp_path, capsys):
+    path = bag(tmp_path)
+    assert check.main([str(path)]) == 0
+    assert 'good' in capsys.readouterr().out
+    assert check.main([str(path), '--json', '--use-region', 'hip_angle=-9:9']) == 0
+    report = json.loads(capsys.readouterr().out)[0]
+    assert report['verdict'] == 'warnings'
+    assert 'coverage_poor' in {finding['code'] for finding in report['findings']}
+
+
+def test_the_command_line_fails_on_unusable_and_on_misuse(tmp_path, capsys):
+    assert check.main([str(tmp_path / 'nothing')]) == 1
+    assert 'unreadable' in capsys.readouterr().out
+    assert check.main([str(bag(tmp_path)), '--use-region', 'hip_angle']) == 2
+    assert 'NAME=LOW:HIGH' in capsys.readouterr().err
+    assert check.main([str(tmp_path), '--note', str(tmp_path / 'no.yaml')]) == 2
+
+
+def test_another_version_of_the_model_is_mentioned(tmp_path):
+    model = tmp_path / 'model.yaml'
+    model.write_text(yaml.safe_dump({'a': 1}))
+    report = check_recording(synthesise(Synthesis(), 0), model=model)
+    assert report.of('model_differs')
+    assert report.verdict == 'good'
+
+
+def test_the_report_prints_places(capsys):
+    report = check_recording(imu_angle(assigned(1234, 1.0))(synthesise(Synthesis(), 0)))
+    report.print(Console(width=200))
+    assert '2.468 s' in capsys.readouterr().out
