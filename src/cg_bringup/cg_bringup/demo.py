@@ -42,7 +42,9 @@ def record_programme(
     """Carry out the experiments; return the bags."""
     bags = []
     with own_domain() as domain:
-        console.print(f'[bold]Recording[/] {len(PROGRAMME)} x {duration:g} s (ROS domain {domain})')
+        console.print(
+            f'[bold]Recording[/] {len(PROGRAMME)} x {duration:g} s (ROS domain {domain})'
+        )
         for index, name in enumerate(PROGRAMME, start=1):
             experiment = load_experiment(name)
             bag = out / f'{index}_{name}'
@@ -79,8 +81,9 @@ def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> di
         raise ExperimentError(
             f'the analysis ended with status {done.returncode}\n{done.stdout}{done.stderr}'
         )
-    console.print(f'[bold]Diagnosis[/] from bags and nominal model alone, '
-                  f'{time.monotonic() - start:.1f} s')
+    console.print(
+        f'[bold]Diagnosis[/] from bags and nominal model alone, {time.monotonic() - start:.1f} s'
+    )
     if done.stdout.strip():
         console.print(done.stdout.strip(), markup=False, highlight=False)
     return json.loads(result.read_text(encoding='utf-8'))
@@ -97,7 +100,9 @@ def reveal(console: Console, nominal: Model, hidden: Hidden) -> None:
     table = Table('parameter', 'nominal', 'true', 'off by', title='and these numbers were off')
     for name, factor in hidden.factors.items():
         value = nominal.values[name]
-        table.add_row(name, f'{value:.4g}', f'{value * factor:.4g}', f'{100 * (factor - 1):+.0f} %')
+        table.add_row(
+            name, f'{value:.4g}', f'{value * factor:.4g}', f'{100 * (factor - 1):+.0f} %'
+        )
     console.print(table)
 
 

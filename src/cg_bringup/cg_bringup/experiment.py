@@ -86,8 +86,10 @@ def _nodes(parameters: Path, output) -> Iterator[dict[str, subprocess.Popen]]:
     try:
         for name, (package, module) in NODE_MODULES.items():
             nodes[name] = subprocess.Popen(
-                [sys.executable, '-m', f'{package}.{module}']
-                + ['--ros-args', '--params-file', str(parameters)],
+                [
+                    *(sys.executable, '-m', f'{package}.{module}'),
+                    *('--ros-args', '--params-file', str(parameters)),
+                ],
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,

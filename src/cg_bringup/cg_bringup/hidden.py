@@ -67,7 +67,7 @@ def hide(nominal: Model, effect: str | None, seed: int) -> Hidden:
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
     values = draw_values(table[name], rng)
     model, factors = perturb(nominal, rng)
-    return Hidden(model.with_effect(name, **values), name, values, factors)
+    return Hidden(model.with_effect(name, None, **values), name, values, factors)
 
 
 def draw_values(ranges: dict[str, Any], rng: np.random.Generator) -> dict[str, float]:

@@ -9,9 +9,9 @@ from rosbags.highlevel import AnyReader
 
 pytest.importorskip('rclpy')
 
-from cg_bringup.experiment import main, run_experiment  # noqa: E402
-from cg_bringup.experiments import ExperimentError, Run, load_experiment  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
+from cg_bringup.experiment import main, run_experiment
+from cg_bringup.experiments import ExperimentError, Run, load_experiment
+from cg_dynamics.domains import own_domain
 
 SENSORS = ('/imu', '/hip_encoder', '/foot_contact/inner', '/foot_contact/outer')
 
@@ -78,9 +78,7 @@ def test_real_time_bag_is_complete(tmp_path):
 def test_the_note_names_set_up_and_model(tmp_path):
     run = Run(load_experiment('spring_stabilised_outer'), tmp_path / 'bag', duration=0.5)
     with AnyReader([run_experiment(run).path]) as reader:
-        ((connection, _, data),) = [
-            m for m in reader.messages() if m[0].topic == '/experiment'
-        ]
+        ((connection, _, data),) = [m for m in reader.messages() if m[0].topic == '/experiment']
         note = yaml.safe_load(reader.deserialize(data, connection.msgtype).data)
     assert note['experiment'] == 'spring_stabilised_outer'
     assert note['setup'] == run.experiment.setup.to_dict()

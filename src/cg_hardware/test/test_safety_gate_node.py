@@ -36,7 +36,9 @@ def bench():
                 assert time.monotonic() < deadline
                 executor.spin_once(timeout_sec=gate.poll())
 
-        until(lambda: publisher.get_subscription_count() and gate.publisher.get_subscription_count())
+        until(
+            lambda: publisher.get_subscription_count() and gate.publisher.get_subscription_count()
+        )
         yield gate, publisher, commands, until
         for node in (gate, peer):
             executor.remove_node(node)

@@ -37,8 +37,11 @@ class ExcitationSettings(Settings):
     f_max: float = setting(4.0, 'highest frequency', unit='Hz', minimum=0.01, maximum=200.0)
     dwell: float = setting(0.5, 'mean time between steps', unit='s', minimum=0.01)
     ramp: float = setting(
-        0.2, 'time over which the torque grows at the start and dies at the end', unit='s',
-        minimum=0.0, maximum=10.0,
+        0.2,
+        'time over which the torque grows at the start and dies at the end',
+        unit='s',
+        minimum=0.0,
+        maximum=10.0,
     )
     seed: int = setting(1, 'seed of phases and steps', minimum=0)
     file: str = setting('', 'CSV file to play: columns time in s, torque in N m')
@@ -135,9 +138,7 @@ def _steps(settings: ExcitationSettings) -> Signal:
     """Levels drawn at random between the two amplitudes, each held for a random time."""
     rng = np.random.default_rng(settings.seed)
     count = 4 + math.ceil(4.0 * settings.duration / settings.dwell)
-    starts = np.concatenate(
-        ([0.0], np.cumsum(rng.uniform(0.5, 1.5, size=count) * settings.dwell))
-    )
+    starts = np.concatenate(([0.0], np.cumsum(rng.uniform(0.5, 1.5, size=count) * settings.dwell)))
     levels = rng.uniform(-settings.amplitude, settings.amplitude, size=count + 1)
     return _held(starts, levels)
 

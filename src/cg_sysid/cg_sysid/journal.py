@@ -132,9 +132,7 @@ class Journal:
         records = b''.join(self._parts)
         compressed = self._compressor.compress(records)
         content = (
-            struct.pack(
-                '<QQQI', self._first_ns, self._last_ns, len(records), zlib.crc32(records)
-            )
+            struct.pack('<QQQI', self._first_ns, self._last_ns, len(records), zlib.crc32(records))
             + _text('zstd')
             + struct.pack('<Q', len(compressed))
             + compressed

@@ -32,9 +32,7 @@ class RecorderSettings(Settings):
     """Parameters of the recorder node."""
 
     bag: str = setting('', 'directory to write, which must not exist yet')
-    mechanism: str = setting(
-        'compass_gait', 'whose topics to record', choices=tuple(MECHANISMS)
-    )
+    mechanism: str = setting('compass_gait', 'whose topics to record', choices=tuple(MECHANISMS))
     also: tuple[str, ...] = setting((), 'further topics, each as name:type')
     time: str = setting(
         'receipt',

@@ -96,9 +96,7 @@ class RecorderNode(Node):
         self.finished, self.exit_status = True, 1
 
     def _offered_qos(self, topic: str) -> list[dict]:
-        return [
-            qos_entry(info.qos_profile) for info in self.get_publishers_info_by_topic(topic)
-        ]
+        return [qos_entry(info.qos_profile) for info in self.get_publishers_info_by_topic(topic)]
 
     def close(self) -> None:
         """Make the recording an ordinary bag."""

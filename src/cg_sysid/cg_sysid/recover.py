@@ -127,9 +127,7 @@ def _sources(path: Path) -> list[Path]:
     return files
 
 
-def _messages(
-    sources: list[Path], kinds: dict[str, Kind], damage: list[str]
-) -> Iterator[Entry]:
+def _messages(sources: list[Path], kinds: dict[str, Kind], damage: list[str]) -> Iterator[Entry]:
     """Every message up to the first damage of each file; fills `kinds` and `damage` on the way."""
     counts: dict[str, int] = {}
     for source in sources:
