@@ -86,7 +86,9 @@ def unpinned(model: Model, stance: str) -> Unpinned:
     hip_rate = v[2:] + l * normal(q[leg]) * v[leg]
 
     effects = acting_effects(model)
-    own = {e.label: {a.name: by_name[f'{e.label}.{a.name}'] for a in e.parameters} for e in effects}
+    own = {
+        e.label: {a.name: by_name[f'{e.label}.{a.name}'] for a in e.parameters} for e in effects
+    }
     up = ca.SX([0, 1])
     for effect in effects:
         up = effect.up(up, own[effect.label])
