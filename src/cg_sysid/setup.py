@@ -31,7 +31,6 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
-        'lz4',
         'matplotlib',
         'mcap',
         'numpy',
