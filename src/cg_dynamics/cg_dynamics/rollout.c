@@ -86,7 +86,8 @@ static void interpolate(int width, double h, double past, const double *x0, cons
     for (int i = 0; i < width; i++) out[i] = a0 * x0[i] + a1 * x1[i] + b0 * d0[i] + b1 * d1[i];
 }
 
-/* Outputs (n, NY) of given states, each late by delay[NY] seconds. */
+/* Outputs (n, NY) of given states, each late by delay[NY] seconds; NaN for what a late sensor
+   saw before the first row, which nobody simulated. */
 void cgm_outputs(int n, const double *time, const double *u, const double *p, const double *X,
                  const double *delay, double *Y)
 {
@@ -245,7 +246,7 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
             if (Y) Y[k * NY + j] = y[j];
             if (Jacobian) memcpy(Jacobian + ((size_t)k * NY + j) * nc, row, nc * sizeof(double));
             double m = measured[k * NY + j];
-            if (m != m) continue;
+            if (m != m || y[j] != y[j]) continue;
             double w2 = weight[j] * weight[j], r = y[j] - m;
             sse[j] += w2 * r * r;
             count[j] += 1;

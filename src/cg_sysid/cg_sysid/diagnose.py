@@ -36,6 +36,7 @@ MATERIAL = 1.0  # an effect must explain this much error, in standard deviations
 AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall
 MOST_ROUNDS = 4
+SCREEN_ITERATIONS = 16
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
 MOST_STARTS = 8
@@ -277,26 +278,21 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    # A short horizon tells which start is worth going on from. The full fit then sets out from
-    # the centre of belief again: the optimum of a short horizon is a poor place for the lumps.
+    # A short horizon tells which start is worth going on from, on the way to the full one.
     models = list(_starting_models(task))
-    if len(models) > 1:
-        looks = []
-        for model in models:
-            try:
-                looks.append((fit(model, train, horizon=SCREEN_S, iterations=8), model))
-            except IdentificationError as error:
-                failure = error
-        if not looks:
-            raise failure
-        looks.sort(key=lambda look: look[0].normalised_error)
-        best, start = looks[0]
-        label = start.effects[-1].label
-        models = [
-            start.with_values({n: v for n, v in best.model.values.items()
-                               if n.startswith(f'{label}.')})
-        ]
-    return fit(models[0], train)
+    if len(models) == 1:
+        return fit(models[0], train)
+    looks = []
+    for model in models:
+        try:
+            look = fit(model, train, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS)
+            looks.append((look, model))
+        except IdentificationError as error:
+            failure = error
+    if not looks:
+        raise failure
+    look, model = min(looks, key=lambda pair: pair[0].normalised_error)
+    return fit(model, train, start=look)
 
 
 def _starting_models(task: Task):
@@ -309,14 +305,11 @@ def _starting_models(task: Task):
 
 
 def _believing(fitted: Model, base: Model) -> Model:
-    # The next fit starts at the identified values but believes what the file believed.
-    quantities = dict(fitted.quantities)
-    for name, q in base.quantities.items():
-        quantities[name] = replace(quantities[name], tolerance=q.tolerance, source=q.source)
-    for name, q in quantities.items():
-        if name not in base.quantities:
-            quantities[name] = replace(q, tolerance=None)
-    return replace(fitted, quantities=quantities)
+    # The next fit believes what the nominal file believes, and of the effects added so far that
+    # they are about what was found.
+    added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
+             if n not in base.quantities}
+    return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
 
 
 def diagnose(
@@ -434,7 +427,7 @@ class _Search:
         reasons += _at_edge(o)
         return Candidate(
             label=o.label,
-            model=o.model,
+            model=o.train.model,
             train=o.train,
             held=o.held,
             evidence=float(gained),

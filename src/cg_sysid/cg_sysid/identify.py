@@ -28,7 +28,7 @@ HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
-DRIFT = 1e-4  # relative change of the cost at which a fit has converged
+DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
 
 class IdentificationError(ValueError):
@@ -42,7 +42,6 @@ class Unknown:
     Attributes:
         name: Full parameter name.
         unit: SI unit.
-        start: First value.
         prior: Centre of what the model file believes.
         tolerance: Standard deviation of that belief; infinite where there is none. For a
             logarithmic unknown it is relative.
@@ -54,7 +53,6 @@ class Unknown:
 
     name: str
     unit: str
-    start: float
     prior: float
     tolerance: float
     lower: float
@@ -68,7 +66,8 @@ class Unknown:
 
     def to_value(self, coordinate: float) -> float:
         """Coordinate -> value."""
-        return float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
+        value = float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
+        return min(max(value, self.lower), self.upper)
 
 
 @dataclass(frozen=True)
@@ -88,6 +87,7 @@ class Fit:
         mse: Mean squared error of each trial and output, in squared noise, shape (trials, ny).
         count: Samples behind `mse`.
         inflation: Variance of the residual over that of the noise, as used in the weights.
+        horizon: Length of the records used, in s.
         evaluations: Number of evaluations of all records.
         seconds: Wall time.
         converged: False if it stopped at the limit of iterations.
@@ -104,6 +104,7 @@ class Fit:
     mse: np.ndarray
     count: np.ndarray
     inflation: float
+    horizon: float
     evaluations: int
     seconds: float
     converged: bool
@@ -152,7 +153,7 @@ def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknow
             tolerance = tolerance / q.value
         found.append(
             Unknown(
-                name, parameter.unit, q.value, q.value, tolerance, parameter.lower,
+                name, parameter.unit, q.value, tolerance, parameter.lower,
                 parameter.upper, parameter.logarithmic, parameter.scale,
             )
         )  # fmt: skip
@@ -362,21 +363,21 @@ def fit(
     model: Model,
     trials: Sequence[Trial],
     only: Sequence[str] | None = None,
-    motions: Sequence[np.ndarray] | None = None,
     iterations: int = 60,
     reweight: bool = True,
     horizon: float = np.inf,
+    start: Fit | None = None,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
     Args:
-        model: Where to start, and what is believed (values, tolerances, bounds).
+        model: What is believed: values, tolerances, bounds. The search sets out from there.
         trials: Prepared records (trial.prepare).
         only: Full names of the parameters to identify; by default all that are free.
-        motions: Initial motion of each trial to start from; by default the trials' own guess.
         iterations: Limit for the last, full-length stage.
         reweight: Let the weights follow the residual that is left.
         horizon: Use only this much of each record, in s: a cheap first look.
+        start: Set out from this fit of the same unknowns to a shorter horizon instead.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -386,11 +387,12 @@ def fit(
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only)
     problem = _Problem(model, trials, unknowns)
-    theta = np.array([u.to_coordinate(u.start) for u in unknowns])
-    motions = [np.array(m) for m in (motions or [t.motion for t in trials])]
+    values = [u.prior for u in unknowns] if start is None else start.values
+    theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
+    motions = [trial.motion for trial in trials] if start is None else list(start.motions)
     longest = min(max(trial.duration for trial in trials), horizon)
-    weight = 1.0
-    stages = [h for h in HORIZONS if h < 0.8 * longest]
+    weight = 1.0 if start is None else 1 / start.inflation
+    stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
     for horizon in stages:
         # The short horizons only lead the way; the belief of the file keeps them sober.
         found = _minimise(problem, theta, motions, horizon, weight, 12, 3e-2)
@@ -425,6 +427,7 @@ def fit(
         mse=point.sse / np.maximum(point.count, 1),
         count=point.count,
         inflation=1 / weight,
+        horizon=longest,
         evaluations=problem.evaluations,
         seconds=clock.perf_counter() - began,
         converged=converged,
