@@ -35,6 +35,8 @@ from rclpy.signals import SignalHandlerOptions
 from cg_dynamics.settings import Settings, describe
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# A publisher keeps a second of its samples: a listener that a busy machine held up gets them all.
+MACHINE_QOS = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED_QOS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,

@@ -8,7 +8,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Int64
 
-from cg_dynamics.ros import SENSOR_QOS, to_stamp
+from cg_dynamics.ros import MACHINE_QOS, to_stamp
 from cg_hardware import topics
 
 
@@ -41,7 +41,7 @@ class SensorPublishers:
             self.joint_states.header.frame_id = topics.TORQUE_FRAME[mechanism]
 
     def _publisher(self, node: Node, kind: type, topic: str) -> None:
-        self.publishers[topic] = node.create_publisher(kind, topic, SENSOR_QOS)
+        self.publishers[topic] = node.create_publisher(kind, topic, MACHINE_QOS)
 
     def _prepare_compass_gait(self, node: Node, variances: dict[str, float]) -> None:
         for kind, topic in (

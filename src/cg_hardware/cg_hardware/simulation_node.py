@@ -48,6 +48,7 @@ from cg_hardware.simulation import (
 
 CATCH_UP = 10  # samples taken at most before messages are looked at again
 RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
+LATE = 0.02  # s behind the clock that are worth a warning
 REPEAT = 0.1  # s between repetitions of the first measurement of a lock-step run
 WARNING_PERIOD = 1.0  # s between equal warnings
 
@@ -205,6 +206,7 @@ class SimulationNode(LifecycleNode):
 
     def _begin(self) -> None:
         self.phase = 'running'
+        self._begun = time.monotonic()
         self.total = ticks_of(self.settings.duration, self.settings.sample_rate_hz)
         self.ticks = 0
         self.epoch_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
@@ -248,7 +250,14 @@ class SimulationNode(LifecycleNode):
                 self._doubt(judgement.doubt)
             if not self._apply(judgement.torque):
                 return 0.0
-        return max(0.0, (self.pace.next_ns - time.monotonic_ns()) / NANOSECONDS)
+        ahead = (self.pace.next_ns - time.monotonic_ns()) / NANOSECONDS
+        if ahead < -LATE:
+            self.get_logger().warning(
+                f'{-ahead:.3f} s late: too busy a machine for real time; samples are not lost, '
+                'but answers count as stale',
+                throttle_duration_sec=WARNING_PERIOD,
+            )
+        return max(0.0, ahead)
 
     def _clock_ns(self) -> int:
         """The machine's clock: the stamps' epoch plus monotonic time, immune to clock changes."""
@@ -351,7 +360,8 @@ class SimulationNode(LifecycleNode):
         if behind and now > self._deadline:
             self._fail('a recorder did not store the last sample')
         elif not behind:
-            self.get_logger().info(f'run of {self.ticks} samples is complete')
+            seconds = time.monotonic() - self._begun
+            self.get_logger().info(f'run is complete: {self.ticks} samples in {seconds:.3f} s')
             self.phase = 'off'
             self.trigger_deactivate()
             self.finished = self.settings.exit_when_done
