@@ -8,7 +8,7 @@ trap 'rm -f "$all"' EXIT
 
 compile() {  # arguments of uv pip compile
     "${UV:-uv}" pip compile --quiet --universal --python-version 3.10 \
-        --generate-hashes --no-header --no-emit-index-url --no-annotate "$@"
+        --generate-hashes --no-strip-extras --no-header --no-emit-index-url --no-annotate "$@"
 }
 
 compile ./*.in --output-file "$all"  # one resolution, so that the parts agree
