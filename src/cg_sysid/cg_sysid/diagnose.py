@@ -163,24 +163,41 @@ class Options:
         effects: Labels or names to try; by default the whole library.
         rounds: Most effects to add.
         workers: Local processes.
+        held: Names of the records to hold out; by default every second one of each set-up.
     """
 
     effects: tuple[str, ...] | None = None
     rounds: int = MOST_ROUNDS
     workers: int | None = None
+    held: tuple[str, ...] | None = None
 
 
-def split(trials: Sequence[Trial]) -> tuple[list[Trial], list[Trial]]:
+def split(
+    trials: Sequence[Trial], chosen: Sequence[str] | None = None
+) -> tuple[list[Trial], list[Trial]]:
     """Training and held-out trials: within each set-up, every second one is held out.
 
+    Args:
+        trials: All of them.
+        chosen: Names of those to hold out instead.
+
     Raises:
-        IdentificationError: if there are fewer than two.
+        IdentificationError: if there are fewer than two, or none is left on one side.
     """
     if len(trials) < 2:
         raise IdentificationError(
             f'{len(trials)} record: a diagnosis needs at least two, one to fit and one to judge; '
             'record another, or cut a long one into windows (--window SECONDS)'
         )
+    if chosen is not None:
+        held = [trial for trial in trials if trial.name in chosen]
+        train = [trial for trial in trials if trial.name not in chosen]
+        if not held or not train:
+            raise IdentificationError(
+                f'{len(held)} of {len(trials)} records held out; at least one is needed to fit '
+                'and one to judge'
+            )
+        return train, held
     groups: dict[str, list[Trial]] = {}
     for trial in trials:
         groups.setdefault(repr(trial.setup), []).append(trial)
@@ -332,7 +349,7 @@ def diagnose(
         IdentificationError: if the records cannot be used with this model.
     """
     options = options or Options()
-    train, held = split(prepare(model, records))
+    train, held = split(prepare(model, records), options.held)
     search = _Search(model, train, held, options, progress or (lambda *_: None), executor)
     return search.run()
 
