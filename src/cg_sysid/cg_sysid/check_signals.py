@@ -26,6 +26,7 @@ SHIFT = 8.0  # step over the noise of a step and over the change of slope around
 SHIFT_QUANTA = 4.0  # step over the resolution, [1]
 MANY_SPIKES = 0.01  # share of samples, [1]
 STILL_S = 1.0  # a sensor may be still this long while others move, in s
+STILL_MOVED = 20.0  # motion over the noise floor before the rest, [1]
 STILL_SHARE = 0.2  # and for this share of the recording, [1]
 SATURATED_RUN = 5  # samples at the limit in a row
 SATURATED_SHARE = 0.01  # share of samples at the limit, [1]
@@ -115,9 +116,11 @@ def _still(signals: dict[str, Signal], names: tuple[str, ...]) -> Iterator[Findi
     Friction can do that too, so that this is a warning.
     """
     for name in names:
-        if name not in signals or not np.ptp(signals[name].values):
+        if name not in signals:
             continue
         signal = signals[name]
+        if np.ptp(signal.values) < STILL_MOVED * signal.noise.sigma_floor:
+            continue  # it never moved, as the hip with its legs tied
         runs = constant_runs(signal.values, FROZEN_SAMPLES)
         if not runs:
             continue
