@@ -1,5 +1,6 @@
 """The simulated hardware on real topics: lock-step, real time, refusals, watchdogs."""
 
+import dataclasses
 import math
 import time
 
@@ -8,7 +9,10 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
-from lifecycle_msgs.msg import State  # noqa: E402
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from rcl_interfaces.msg import ParameterType  # noqa: E402
+from rcl_interfaces.srv import DescribeParameters  # noqa: E402
 from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
@@ -17,6 +21,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
+from cg_hardware.simulation import SimulationSettings  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
 
 PATIENCE = 20.0  # s; discovery on a busy machine
@@ -155,6 +160,39 @@ def test_parameters_are_refused_with_a_reason(bench):
     assert 'seed cannot change while the node is at work' in result.reason
     with pytest.raises(ValueError, match='mode'):
         bench.machine(mode='sideways')
+
+
+def test_parameters_are_described_over_the_graph(bench):
+    bench.machine()
+    client = bench.controller.create_client(
+        DescribeParameters, '/simulation_node/describe_parameters'
+    )
+    bench.until(client.service_is_ready)
+    names = [field.name for field in dataclasses.fields(SimulationSettings)]
+    future = client.call_async(DescribeParameters.Request(names=names))
+    bench.until(future.done)
+    described = {d.name: d for d in future.result().descriptors}
+    assert all(d.description for d in described.values())
+    assert '[Hz]' in described['sample_rate_hz'].description
+    assert described['sample_rate_hz'].floating_point_range[0].to_value == 2000.0
+    assert described['initial_state'].type == ParameterType.PARAMETER_DOUBLE_ARRAY
+
+
+def test_lifecycle_services_answer(bench):
+    machine = bench.machine(autostart=False)
+    client = bench.controller.create_client(ChangeState, '/simulation_node/change_state')
+    bench.until(client.service_is_ready)
+    for transition, state in (
+        (Transition.TRANSITION_CONFIGURE, State.PRIMARY_STATE_INACTIVE),
+        (Transition.TRANSITION_ACTIVATE, State.PRIMARY_STATE_ACTIVE),
+        (Transition.TRANSITION_DEACTIVATE, State.PRIMARY_STATE_INACTIVE),
+        (Transition.TRANSITION_CLEANUP, State.PRIMARY_STATE_UNCONFIGURED),
+    ):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        future = client.call_async(request)
+        bench.until(future.done)
+        assert future.result().success
+        assert machine._state_machine.current_state[0] == state
 
 
 def test_missing_model_is_refused(bench):
