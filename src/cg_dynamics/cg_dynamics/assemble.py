@@ -23,7 +23,7 @@ class Equations:
 
     Attributes:
         x: State, shape (nx, 1).
-        u: Inputs as the drive reports them, shape (nu, 1), in N m.
+        u: Inputs: torques as the drive reports them in N m, then extra ones, shape (nu, 1).
         p: Parameters, shape (np, 1).
         rates: dx/dt.
         outputs: What the sensors report, before any delay, shape (ny, 1).
@@ -34,6 +34,7 @@ class Equations:
         energy: Kinetic plus potential energy of bodies and springs in J.
         state_names: Names of x.
         parameter_names: Full names of p.
+        input_names: Names of u: torques, then inputs that effects ask for.
         channels: Output channels, the order of `outputs`.
         coordinates: Number m of free coordinates.
         largest_step: Longest step in s at which every effect is simulated well.
@@ -51,6 +52,7 @@ class Equations:
     energy: ca.SX
     state_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
+    input_names: tuple[str, ...]
     channels: tuple[str, ...]
     coordinates: int
     largest_step: float
@@ -96,6 +98,12 @@ def assemble(model: Model, setup: Setup) -> Equations:
         effect.label: {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
         for effect in effects
     }
+    extra_inputs = tuple(dict.fromkeys(name for e in effects for name in e.extra_inputs))
+    u = ca.SX.sym('u', len(mechanism.inputs) + len(extra_inputs))
+    torque_inputs = ca.vertsplit(u)[: len(mechanism.inputs)]
+    measured = dict(zip(extra_inputs, ca.vertsplit(u)[len(mechanism.inputs) :], strict=True))
+    for e in effects:
+        own[e.label] |= {name: measured[name] for name in e.extra_inputs}
     kinematics = mechanism.kinematics(setup)
     m = len(kinematics.names)
     extra = [f'{effect.label}.{state}' for effect in effects for state in effect.states]
@@ -104,7 +112,6 @@ def assemble(model: Model, setup: Setup) -> Equations:
     z = dict(zip(extra, ca.vertsplit(x[2 * m :]), strict=True)) if extra else {}
     z_of = {e.label: [z[f'{e.label}.{state}'] for state in e.states] for e in effects}
     dz: dict[str, list[ca.SX]] = {}
-    u = ca.SX.sym('u', len(mechanism.inputs))
 
     def pass_through(effect, result):
         value, rates = result
@@ -115,7 +122,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
     # Torque path: what the drive reports -> motor -> transmission -> joint.
     torques, starts = [], {}
     for joint, row, reported in zip(
-        mechanism.joints, mechanism.joints.values(), ca.vertsplit(u), strict=True
+        mechanism.joints, mechanism.joints.values(), torque_inputs, strict=True
     ):
         here = [e for e in effects if e.site == joint or e.site == 'all']
         joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
@@ -198,6 +205,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
             *extra,
         ),
         parameter_names=names,
+        input_names=(*mechanism.inputs, *extra_inputs),
         channels=tuple(outputs),
         coordinates=m,
         largest_step=min((e.largest_step for e in effects), default=float('inf')),

@@ -84,6 +84,7 @@ class CompiledModel:
         self.free = free
         self.state_names = equations.state_names
         self.parameter_names = equations.parameter_names
+        self.input_names = equations.input_names
         self.channels = equations.channels
         self.nx, self.nu = equations.x.shape[0], equations.u.shape[0]
         self.np, self.ny = equations.p.shape[0], equations.outputs.shape[0]

@@ -101,7 +101,10 @@ class InterpretedRollout:
             y[:, j], J[:, j] = late_y[:, j], late_J[:, j]
             if delay_to[j] >= 0:
                 e = 1e-6
-                ahead = late + e * np.asarray(self._f(late.T, u[at].T, p)).T
+                moving = np.asarray(self._f(late.T, u[at].T, p)).T
+                straight = (t <= time[0]) | (at == good - 1)
+                moving[straight] = slopes[0][at[straight]]
+                ahead = late + e * moving
                 value = np.asarray(self._h(ahead.T, u[at].T, p))[j]
                 J[:, j, delay_to[j]] -= (value - late_y[:, j]) / e
         if Y is not None:

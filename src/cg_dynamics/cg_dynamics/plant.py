@@ -74,7 +74,8 @@ class Plant:
                     f'got shape {motion.shape}'
                 )
         self._input_delay, self._output_delays, _ = self._compiled.delays(self._p)
-        self._applied = np.zeros(self._compiled.nu)
+        self._torques = len(model.mechanism.inputs)
+        self._applied = self._inputs(np.zeros(self._torques))
         self._latches: list[tuple[float, np.ndarray]] = [(-np.inf, self._applied)]
         self._x = self._compiled.initial_state(motion, self._applied, self._p)
         self._tick = 0
@@ -97,13 +98,15 @@ class Plant:
     def latch(self, torque: np.ndarray) -> None:
         """Give the drive a new set-point in N m, shape (nu,); it holds until the next."""
         torque = np.array(torque, float)
-        if torque.shape != self._applied.shape or not np.isfinite(torque).all():
-            raise ValueError(
-                f'torque must be {len(self._applied)} finite numbers in N m, got {torque}'
-            )
+        if torque.shape != (self._torques,) or not np.isfinite(torque).all():
+            raise ValueError(f'torque must be {self._torques} finite numbers in N m, got {torque}')
         limit = self.model.torque_limit
-        self._applied = np.clip(torque, -limit, limit)
+        self._applied = self._inputs(np.clip(torque, -limit, limit))
         self._latches.append((self.time, self._applied))
+
+    def _inputs(self, torque: np.ndarray) -> np.ndarray:
+        # Extra inputs of the simulated machine are switches that are on.
+        return np.concatenate([torque, np.ones(self._compiled.nu - self._torques)])
 
     def advance(self) -> None:
         """Move on by one sample time.
@@ -147,7 +150,7 @@ class Plant:
             self._tick * self.sample_ns,
             outputs,
             counts,
-            self._applied.copy(),
+            self._applied[: self._torques].copy(),
             self._contact(),
             self._x.copy(),
         )

@@ -232,7 +232,10 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
             if (delay_to[j] >= 0) {
                 /* dy/d(delay) = -C dx/dt, by a difference along the trajectory. */
                 double ahead[NX], late_d[NX], value[NY], w[W], e = 1e-6;
-                rates(late_x, u + b * NU, p, late_d);
+                if (x1)
+                    rates(late_x, u + b * NU, p, late_d);
+                else
+                    memcpy(late_d, d0, sizeof late_d);
                 for (int i = 0; i < NX; i++) ahead[i] = late_x[i] + e * late_d[i];
                 const double *arg[3] = {ahead, u + b * NU, p};
                 double *res[1] = {value};

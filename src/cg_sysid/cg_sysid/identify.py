@@ -171,6 +171,7 @@ class _Problem:
     vectors: list[np.ndarray] = field(default_factory=list)
     places: list[np.ndarray] = field(default_factory=list)
     columns: list[np.ndarray] = field(default_factory=list)
+    inputs: list[np.ndarray] = field(default_factory=list)
     evaluations: int = 0
 
     def __post_init__(self):
@@ -180,6 +181,7 @@ class _Problem:
             compiled = compile_model(self.model, trial.setup, default)
             m2 = 2 * compiled.equations.coordinates
             self.compiled.append(compiled)
+            self.inputs.append(trial.inputs_for(compiled.input_names))
             self.vectors.append(parameter_vector(self.model, trial.setup))
             self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
             self.columns.append(
@@ -257,10 +259,10 @@ def _evaluate(
         shared_h += BARRIER * jacobian.T @ jacobian
     problem.evaluations += 1
     for i, trial in enumerate(problem.trials):
-        compiled, p = problem.compiled[i], problem.vectors[i]
+        compiled, p, u = problem.compiled[i], problem.vectors[i], problem.inputs[i]
         p[problem.places[i]] = values
         n = int(np.searchsorted(trial.time, horizon, side='right'))
-        x0, by_motion, by_free = compiled.initial_sensitivity(motions[i], trial.inputs[0], p)
+        x0, by_motion, by_free = compiled.initial_sensitivity(motions[i], u[0], p)
         m2 = len(motions[i])
         s0 = np.zeros((compiled.nx, m2 + k))
         s0[:, :m2] = by_motion
@@ -268,7 +270,7 @@ def _evaluate(
             if column >= 0:
                 s0[:, column] = by_free[:, f]
         normal, _, _ = compiled.normal(
-            trial.time[:n], trial.inputs[:n], x0, s0, p, problem.columns[i],
+            trial.time[:n], u[:n], x0, s0, p, problem.columns[i],
             trial.outputs[:n], 1 / trial.sigma,
         )  # fmt: skip
         if normal.rows < n or not np.isfinite(normal.sse).all():
@@ -519,9 +521,10 @@ def predict(model: Model, trial: Trial, motion: np.ndarray) -> np.ndarray:
     """Outputs that a model simulates along a trial from an initial motion, shape (n, ny)."""
     compiled = compile_model(model, trial.setup)
     p = parameter_vector(model, trial.setup)
-    x0 = compiled.initial_state(motion, trial.inputs[0], p)
-    states = compiled.simulate(trial.time, trial.inputs, x0, p)
-    return compiled.outputs(trial.time, trial.inputs, states, p)
+    u = trial.inputs_for(compiled.input_names)
+    x0 = compiled.initial_state(motion, u[0], p)
+    states = compiled.simulate(trial.time, u, x0, p)
+    return compiled.outputs(trial.time, u, states, p)
 
 
 def score(model: Model, trials: Sequence[Trial]) -> Fit:

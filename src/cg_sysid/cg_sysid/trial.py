@@ -48,6 +48,21 @@ class Trial:
     motion: np.ndarray
     motion_sigma: np.ndarray
 
+    def inputs_for(self, names: Sequence[str]) -> np.ndarray:
+        """Inputs in the order that a model wants, shape (n, len(names)).
+
+        A switch that was not recorded (`drive_enabled`) counts as on.
+        """
+        if tuple(names) == self.input_names:
+            return self.inputs
+        ones = np.ones(len(self.time))
+        return np.column_stack(
+            [
+                self.inputs[:, self.input_names.index(n)] if n in self.input_names else ones
+                for n in names
+            ]
+        )
+
     @property
     def duration(self) -> float:
         """Length in s."""

@@ -62,6 +62,8 @@ class Effect:
         parameters: Declared parameters.
         states: Names of extra states.
         largest_step: Longest integration step in s at which the effect is still simulated well.
+        extra_inputs: Measured inputs besides the torques that the effect needs; they come with
+            its parameters in `p`.
         at: Joint, body or sensor where this instance acts; None where there is only one.
     """
 
@@ -71,6 +73,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     states: ClassVar[tuple[str, ...]] = ()
     largest_step: ClassVar[float] = float('inf')
+    extra_inputs: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, mechanism: Mechanism, at: str | None = None):
         sites = self.sites(mechanism)
