@@ -128,7 +128,7 @@ def _read_open(
             raise RecordingError(msg)
     samples: dict[str, list[tuple[int, int, dict[str, float]]]] = {c.topic: [] for c in used}
     for connection, log_ns, data in reader.messages(connections=used) if used else ():
-        message = reader.deserialize(data, connection.msgtype)
+        message: Any = reader.deserialize(data, connection.msgtype)
         rows = samples[connection.topic]
         try:
             values = channels.extract(message, topics[connection.topic])
@@ -178,7 +178,10 @@ def _read_note(path: Path, reader: AnyReader) -> dict[str, Any]:
             msg = f'{path}: topic {NOTE_TOPIC} has type {connection.msgtype}; {STRING} is needed'
             raise RecordingError(msg)
     messages = reader.messages(connections=connections) if connections else ()
-    texts = {reader.deserialize(data, connection.msgtype).data for connection, _, data in messages}
+    texts = set()
+    for connection, _, data in messages:
+        message: Any = reader.deserialize(data, connection.msgtype)
+        texts.add(message.data)
     if len(texts) > 1:
         msg = f'{path}: {len(texts)} different notes on {NOTE_TOPIC}; a bag is one experiment'
         raise RecordingError(msg)

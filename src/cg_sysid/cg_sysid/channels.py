@@ -8,6 +8,7 @@ work on any object that has the fields of the ROS message: those of `rosbags`, o
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import atan2, cos, isfinite, sin, sqrt
+from typing import Any
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 IMU = 'sensor_msgs/msg/Imu'
@@ -198,7 +199,7 @@ def pitch_from_quaternion(x: float, y: float, z: float, w: float) -> float:
     return atan2(2.0 * (w * y - x * z), 1.0 - 2.0 * (x * x + y * y))
 
 
-def extract(message: object, topic: Topic) -> dict[str, float]:
+def extract(message: Any, topic: Topic) -> dict[str, float]:
     """Values of a topic's channels in one message.
 
     A value that the message declares absent (covariance[0] = -1 in an Imu, a joint that is not
@@ -214,7 +215,7 @@ def extract(message: object, topic: Topic) -> dict[str, float]:
     return EXTRACTORS[topic.msgtype](message, topic)
 
 
-def _extract_joint_state(message: object, topic: Topic) -> dict[str, float]:
+def _extract_joint_state(message: Any, topic: Topic) -> dict[str, float]:
     names = list(message.name)
     values = {}
     for channel in topic.channels:
@@ -229,7 +230,7 @@ def _extract_joint_state(message: object, topic: Topic) -> dict[str, float]:
     return values
 
 
-def _extract_imu(message: object, topic: Topic) -> dict[str, float]:
+def _extract_imu(message: Any, topic: Topic) -> dict[str, float]:
     values = {}
     for channel in topic.channels:
         if channel.field == 'pitch' and message.orientation_covariance[0] != -1.0:
@@ -244,7 +245,7 @@ def _extract_imu(message: object, topic: Topic) -> dict[str, float]:
     return values
 
 
-EXTRACTORS: dict[str, Callable[[object, Topic], dict[str, float]]] = {
+EXTRACTORS: dict[str, Callable[[Any, Topic], dict[str, float]]] = {
     JOINT_STATE: _extract_joint_state,
     IMU: _extract_imu,
 }

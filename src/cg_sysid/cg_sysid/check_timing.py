@@ -10,7 +10,7 @@ from cg_sysid.raw import RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S
 
 GAP = 2.5  # a spacing this many times the usual one lacks samples, [1]
-GAP_REGULAR = 1.6  # the same where the stamps are regular, [1]
+GAP_REGULAR = 1.8  # the same where the stamps are regular, [1]
 REGULAR_SPREAD = 1.25  # regular: 95 % of the spacings are below this times the median, [1]
 LONG_GAP_S = 0.1  # a torque that changed over a gap this long is not known, in s
 LOST_SHARE = 0.2  # share of lost samples that makes a topic useless, [1]
@@ -193,8 +193,9 @@ def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]
             'rate_change', 'warning', topic.name,
             f'the rate changes midway, from {before:.4g} Hz to {after:.4g} Hz',
             _seconds(stamp[k], origin), _seconds(stamp[-1], origin), k, after, before)
-    known = isinstance(nominal_hz, int | float) and nominal_hz > 0
-    if known and abs(rate / nominal_hz - 1.0) > RATE_TOLERANCE:
+    if not isinstance(nominal_hz, int | float) or not nominal_hz > 0:
+        return
+    if abs(rate / nominal_hz - 1.0) > RATE_TOLERANCE:
         yield Finding('rate', 'warning', topic.name,
                       f'{rate:.4g} Hz instead of the nominal {nominal_hz:.4g} Hz',
                       value=rate, allowed=nominal_hz)
