@@ -163,9 +163,7 @@ class _Leg:
         self.inputs.append(u)
 
     def arc(self) -> Arc:
-        return Arc(
-            self.stance, np.array(self.time), np.array(self.states), np.array(self.inputs)
-        )
+        return Arc(self.stance, np.array(self.time), np.array(self.states), np.array(self.inputs))
 
 
 def walk(

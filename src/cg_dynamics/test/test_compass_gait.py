@@ -112,9 +112,7 @@ def test_motion_satisfies_eq_4_4_to_4_6_as_printed(bare, x):
     minus, plus = theta[1] - theta[0], theta.sum() / 2
     w2 = p['gravity'] / p['leg_length']
     coupling = c3 - c5 * np.cos(minus) + 2 * c6 * np.cos(minus / 2)
-    H = np.array(
-        [[c2, coupling], [coupling, 1 + c1 - 2 * c4 + 4 * c6 * np.cos(minus / 2)]]
-    )
+    H = np.array([[c2, coupling], [coupling, 1 + c1 - 2 * c4 + 4 * c6 * np.cos(minus / 2)]])
     C = np.array(
         [
             [0, (c5 * np.sin(minus) - 2 * c6 * np.sin(minus / 2)) * rates[1]],
@@ -139,9 +137,7 @@ def test_motion_satisfies_eq_4_4_to_4_6_as_printed(bare, x):
 
 def test_swapping_the_legs_swaps_the_lumps(bare):
     p = bare.values
-    mirrored = bare.with_values(
-        {'c1': p['c2'], 'c2': p['c1'], 'c4': p['c5'], 'c5': p['c4']}
-    )
+    mirrored = bare.with_values({'c1': p['c2'], 'c2': p['c1'], 'c4': p['c5'], 'c5': p['c4']})
     inner = compile_model(bare, Setup(stance='inner'))
     outer = compile_model(mirrored, Setup(stance='outer'))
     for x in STATES:
@@ -203,7 +199,7 @@ def test_energy_is_conserved_over_seconds(bare, setup):
 
 
 def test_spring_holds_the_leg_in_a_hand_made_equilibrium(bare, springs):
-    """Both springs straight out at the height of their points, pulling alike; then only gravity."""
+    """Both springs straight out at the height of their points, pulling alike."""
     level = tuple(
         type(s)('inner', point=1.0, anchor=(x, 1.0), stiffness=300.0, free_length=0.2)
         for s, x in zip(springs, (-0.6, 0.6), strict=True)

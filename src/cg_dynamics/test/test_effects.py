@@ -11,9 +11,7 @@ from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.rig import Setup
 
 COMPASS = MECHANISMS['compass_gait']
-EVERYWHERE = [
-    (name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)
-]
+EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]
 TIME = np.arange(0, 0.6, 0.002)
 TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME))[:, None]
 START = np.array([0.05, 0.1, 0.2, -0.3])
@@ -150,7 +148,7 @@ def test_slope_turns_gravity_as_if_all_angles_were_turned(bare):
     """On ground that falls ahead by a, a robot at angle q to the ground leans by q + a."""
     a, x = 0.08, np.array([0.1, -0.2, 0.3, 0.4])
     tilted = right_side(bare.with_effect('ground_slope', angle=a))(x, 2.0)[0]
-    level = right_side(bare)(x + [a, a, 0, 0], 2.0)[0]
+    level = right_side(bare)(x + np.array([a, a, 0, 0]), 2.0)[0]
     np.testing.assert_allclose(tilted, level, rtol=1e-12)
 
 

@@ -95,14 +95,16 @@ def simulate_mujoco(
     reports = time - hidden.sensor_delay
     q, v = np.empty((len(time), 2)), np.empty((len(time), 2))
     late_q, late_v = q.copy(), v.copy()
-    # Before the first sample the robot is taken to have moved straight on.
-    start_q, start_v = robot.legs()
     edges = np.unique(np.round(np.concatenate([[0.0], time, changes, reports[reports > 0]]), 12))
     edges = edges[edges <= time[-1] + 1e-12]
     early = reports <= 0
-    late_q[early] = start_q + np.outer(reports[early], start_v)
-    late_v[early] = start_v
     with robot.callback():
+        # Before the first sample, angles and rates are taken to have run straight.
+        robot.torque = hidden.torque_gain * torque[0] + hidden.torque_bias
+        mujoco.mj_forward(robot.model, robot.data)
+        start_q, start_v = robot.legs()
+        late_q[early] = start_q + np.outer(reports[early], start_v)
+        late_v[early] = start_v + np.outer(reports[early], robot.accelerations())
         for index, begin in enumerate(edges):
             _keep(q, v, time, begin, robot)
             _keep(late_q, late_v, np.where(early, np.nan, reports), begin, robot)
@@ -163,13 +165,17 @@ class _Robot:
 
     def legs(self) -> tuple[np.ndarray, np.ndarray]:
         """(q_inner, q_outer) and rates."""
-        found = []
-        for full in (self.data.qpos, self.data.qvel):
-            standing = 0.0 if self.joint['stance'] is None else full[self.joint['stance']]
-            swinging = standing + (0.0 if self.joint['hip'] is None else full[self.joint['hip']])
-            pair = [standing, swinging]
-            found.append(np.array(pair if self.setup.stance == 'inner' else pair[::-1]))
-        return found[0], found[1]
+        return self._absolute(self.data.qpos), self._absolute(self.data.qvel)
+
+    def accelerations(self) -> np.ndarray:
+        """Second derivatives of (q_inner, q_outer)."""
+        return self._absolute(self.data.qacc)
+
+    def _absolute(self, joints) -> np.ndarray:
+        standing = 0.0 if self.joint['stance'] is None else joints[self.joint['stance']]
+        swinging = standing + (0.0 if self.joint['hip'] is None else joints[self.joint['hip']])
+        pair = [standing, swinging]
+        return np.array(pair if self.setup.stance == 'inner' else pair[::-1])
 
     def advance(self, duration: float, fine_step: float) -> None:
         steps = max(1, math.ceil(duration / fine_step - 1e-9))
@@ -181,8 +187,6 @@ class _Robot:
 
     def apply(self, model, data) -> None:
         """All torques at the hip; called at every stage of every step."""
-        if model is not self.model and model.nq != self.model.nq:
-            return
         hip, hidden = self.joint['hip'], self.hidden
         if hip is None:
             return

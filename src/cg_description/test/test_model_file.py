@@ -1,0 +1,105 @@
+"""Model files: form is checked, errors say what and where, files are written whole."""
+
+import os
+import stat
+
+import pytest
+
+from cg_description.model_file import (
+    ModelFileError,
+    Quantity,
+    dump,
+    load,
+    parse,
+    quantity,
+    save,
+    sha256,
+    write_atomically,
+)
+from cg_description.paths import model_path, models_directory
+
+MINIMAL = """
+format: cg_model/1
+name: thing
+mechanism: pendulum
+parameters:
+  inertia: {value: 0.3, unit: kg m^2, tolerance: 0.1, fixed: true, source: scales}
+"""
+
+
+def test_parse_and_dump_are_inverse():
+    file = parse(MINIMAL)
+    assert file.parameters['inertia'] == Quantity(0.3, 'kg m^2', 0.1, True, 'scales')
+    assert parse(dump(file)) == file
+
+
+@pytest.mark.parametrize('path', sorted(models_directory().glob('*.yaml')), ids=lambda p: p.stem)
+def test_models_that_come_along_read_back(path):
+    file = load(path)
+    assert parse(dump(file)) == file
+    assert file.name == path.stem
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('[1, 2', 'here: not YAML'),
+        ('just words', 'expected a mapping'),
+        ('format: other/1', "format is 'other/1', expected 'cg_model/1'"),
+        ('format: cg_model/1', "'name' is missing"),
+        (MINIMAL.replace('mechanism: pendulum\n', ''), "'mechanism' is missing"),
+        (MINIMAL + 'colour: red\n', "unknown entry 'colour'; allowed"),
+        (MINIMAL.replace('unit: kg m^2, ', ''), r'parameters.inertia: expected \{value'),
+        (MINIMAL.replace('0.3', 'heavy'), "inertia.value: expected a number, got 'heavy'"),
+        (MINIMAL.replace('0.3', 'true'), 'inertia.value: expected a number, got True'),
+        (MINIMAL.replace('0.3', '.nan'), 'expected a finite number, got nan'),
+        (MINIMAL.replace('tolerance', 'sigma'), "unknown entry 'sigma'; allowed are value"),
+        (MINIMAL.replace('0.1', '.inf'), 'tolerance: expected a finite number'),
+        (MINIMAL + 'effects: [payload]', r'effects\[0\]: expected \{name'),
+        (MINIMAL + 'effects: [{name: a, where: b}]', "effects.0.: unknown entry 'where'"),
+        (MINIMAL + 'sensors: {angle: 3}', 'sensors.angle: expected a mapping of quantities'),
+    ],
+)
+def test_wrong_form_is_named(text, message):
+    with pytest.raises(ModelFileError, match=message):
+        parse(text, 'here')
+
+
+def test_infinite_values_are_allowed_where_they_mean_rigid():
+    assert quantity({'value': float('inf'), 'unit': 'N m/rad'}, 'k').value == float('inf')
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(ModelFileError, match=r'cannot read model file .*none\.yaml'):
+        load(tmp_path / 'none.yaml')
+
+
+def test_unknown_model_lists_those_there_are():
+    with pytest.raises(ModelFileError, match=r"no model called 'none'; there are: .*compass_gait"):
+        model_path('none')
+
+
+def test_file_is_whole_or_not_there(tmp_path, monkeypatch):
+    path = tmp_path / 'model.yaml'
+    save(parse(MINIMAL), path)
+    before = path.read_text()
+
+    def fail(*_):
+        raise OSError('disk full')
+
+    monkeypatch.setattr(os, 'fsync', fail)
+    with pytest.raises(OSError, match='disk full'):
+        write_atomically(path, 'half of it')
+    assert path.read_text() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_file_is_as_readable_as_its_neighbours(tmp_path):
+    path, neighbour = tmp_path / 'a.yaml', tmp_path / 'b.yaml'
+    write_atomically(path, 'text')
+    neighbour.write_text('text')
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(neighbour.stat().st_mode)
+
+
+def test_hash_is_that_of_the_text():
+    assert sha256('') == 'e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855'

@@ -1,0 +1,217 @@
+"""Compiled rollouts: sensitivities against differences, inputs, delays, cache and failures."""
+
+import numpy as np
+import pytest
+
+from cg_dynamics import compiled as module
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import CompiledModel, compile_model, simulate
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.mechanisms import MECHANISMS
+from cg_dynamics.rig import Setup
+
+TIME = np.arange(0, 0.4, 0.002)
+TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME) + 3 * np.cos(50 * TIME))[:, None]
+# Values off the grid of rows and off the neutral value, as identification meets them.
+VALUES = {
+    'actuator_delay': {'delay': 0.0053},
+    'sensor_delay': {'delay': 0.0047},
+    'backlash': {'gap': 0.02},
+}
+
+
+def start(compiled, p):
+    motion = np.array([0.05, 0.12, 0.2, -0.3])
+    m2 = 2 * compiled.equations.coordinates
+    return motion[:m2] if m2 == 4 else motion[[0, 2]]
+
+
+def jacobian_and_differences(model, setup, backend=None):
+    compiled = compile_model(model, setup)
+    if backend is not None:
+        compiled = CompiledModel(compiled.equations, compiled.free, None)
+    p = parameter_vector(model, setup)
+    motion = start(compiled, p)
+    m2, nf = len(motion), len(compiled.free)
+
+    def outputs(motion, p):
+        x0 = compiled.initial_state(motion, TORQUE[0], p)
+        return compiled.outputs(TIME, TORQUE, compiled.simulate(TIME, TORQUE, x0, p), p)
+
+    x0, by_motion, by_free = compiled.initial_sensitivity(motion, TORQUE[0], p)
+    s0, column = np.hstack([by_motion, by_free]), np.arange(m2, m2 + nf)
+    measured = np.zeros((len(TIME), compiled.ny))
+    normal, y, J = compiled.normal(
+        TIME, TORQUE, x0, s0, p, column, measured, np.ones(compiled.ny), keep=True
+    )
+    np.testing.assert_allclose(y, outputs(motion, p), atol=1e-12)
+    differences = np.empty_like(J)
+    for j in range(m2 + nf):
+        ahead, behind = [motion.copy(), p.copy()], [motion.copy(), p.copy()]
+        if j < m2:
+            which, index, h = 0, j, 1e-5
+        else:
+            which, index = 1, compiled.parameter_names.index(compiled.free[j - m2])
+            h = 1e-5 * max(abs(p[index]), 1e-3)
+        ahead[which][index] += h
+        behind[which][index] -= h
+        differences[:, :, j] = (outputs(*ahead) - outputs(*behind)) / (2 * h)
+    return compiled, normal, y, J, differences
+
+
+def assert_close(J, differences):
+    scale = np.abs(differences).max(axis=(0, 1))
+    error = np.abs(J - differences).max(axis=(0, 1)) / np.maximum(scale, 1e-6)
+    # Differences of a Runge-Kutta solution; a delayed output is a cubic between rows.
+    assert error.max() < 2e-4, error
+
+
+@pytest.mark.parametrize(
+    ('name', 'site'),
+    [(n, s) for n, e in LIBRARY.items() for s in e.sites(MECHANISMS['compass_gait'])],
+)
+def test_sensitivities_under_every_effect(bare, springs, name, site):
+    model = bare.with_effect(name, at=site, **VALUES.get(name, {}))
+    _, _, _, J, differences = jacobian_and_differences(model, Setup(springs=springs))
+    assert_close(J, differences)
+
+
+def test_sensitivities_in_every_setup(robot, setup):
+    model = robot.with_values({'coulomb_friction.transition_rate': 0.1})
+    model = model.with_effect('payload', at='outer', mass=0.7, distance=0.4)
+    _, _, _, J, differences = jacobian_and_differences(model, setup)
+    assert_close(J, differences)
+
+
+def test_sensitivities_of_many_effects_at_once(robot, springs):
+    model = robot.with_values({'coulomb_friction.transition_rate': 0.1})
+    for name in ('payload', 'joint_flexibility', 'actuator_delay', 'sensor_delay', 'imu_offset'):
+        model = model.with_effect(name, **VALUES.get(name, {}))
+    _, _, _, J, differences = jacobian_and_differences(model, Setup(springs=springs))
+    assert_close(J, differences)
+
+
+def test_normal_equations_are_those_of_the_jacobian(robot, rng):
+    compiled, p = compile_model(robot, Setup()), parameter_vector(robot, Setup())
+    x0 = np.array([0.05, 0.12, 0.2, -0.3])
+    nf = len(compiled.free)
+    s0, column = np.hstack([np.eye(4), np.zeros((4, nf))]), np.arange(4, 4 + nf)
+    measured = rng.normal(0, 0.1, size=(len(TIME), 3))
+    measured[::3, 1] = np.nan
+    weight = np.array([2.0, 3.0, 5.0])
+    normal, y, J = compiled.normal(TIME, TORQUE, x0, s0, p, column, measured, weight, keep=True)
+    residual = np.where(np.isnan(measured), 0, y - measured) * weight
+    J = np.where(np.isnan(measured)[:, :, None], 0, J) * weight[:, None]
+    J = J.reshape(-1, J.shape[2])
+    np.testing.assert_allclose(normal.hessian, J.T @ J, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(normal.gradient, J.T @ residual.ravel(), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(normal.sse, (residual**2).sum(axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(normal.count, (~np.isnan(measured)).sum(axis=0))
+    assert normal.rows == len(TIME)
+
+
+def test_parameters_without_a_column_stay_constant(robot):
+    compiled, p = compile_model(robot, Setup()), parameter_vector(robot, Setup())
+    x0, nf = np.array([0.05, 0.12, 0.2, -0.3]), len(compiled.free)
+    measured, weight = np.zeros((len(TIME), 3)), np.ones(3)
+    full = compiled.normal(
+        TIME, TORQUE, x0, np.zeros((4, nf)), p, np.arange(nf), measured, weight, keep=True
+    )[2]
+    column = np.full(nf, -1)
+    column[2] = 0
+    one = compiled.normal(
+        TIME, TORQUE, x0, np.zeros((4, 1)), p, column, measured, weight, keep=True
+    )[2]
+    np.testing.assert_allclose(one[:, :, 0], full[:, :, 2], rtol=1e-13)
+
+
+def test_inputs_are_held_between_uneven_rows(bare, rng):
+    """A row put between two others, with the same input, changes nothing."""
+    time = np.cumsum(rng.uniform(0.001, 0.006, size=60))
+    torque = rng.normal(0, 4, size=(60, 1))
+    x0 = np.array([0.05, 0.12, 0.2, -0.3])
+    states, _ = simulate(bare, Setup(), time, torque, x0)
+    between = np.insert(time, 31, time[30] + 0.4 * (time[31] - time[30]))
+    repeated = np.insert(torque, 31, torque[30], axis=0)
+    again, _ = simulate(bare, Setup(), between, repeated, x0)
+    # Runge-Kutta of other steps.
+    np.testing.assert_allclose(np.delete(again, 31, axis=0), states, atol=1e-8)
+
+
+def test_order_of_the_integrator_is_four(bare):
+    compiled, p = compile_model(bare, Setup()), parameter_vector(bare, Setup())
+
+    def end(steps):
+        x = np.array([0.05, 0.12, 0.2, -0.3])
+        compiled.advance(x, np.array([3.0]), p, 0.4 / steps, steps)
+        return x
+
+    exact = end(4000)
+    ratio = np.abs(end(20) - exact).max() / np.abs(end(40) - exact).max()
+    assert 12 < ratio < 22
+
+
+def test_runaway_is_an_error_that_says_when(bare):
+    torque = np.full((1000, 1), 1e9)
+    with pytest.raises(SimulationError, match='runs away') as caught:
+        simulate(bare, Setup(), np.arange(1000) * 0.002, torque, np.zeros(4))
+    assert 0 <= caught.value.time < 2
+
+
+def test_library_is_built_once_and_found_again(bare, tmp_path, monkeypatch):
+    if module.compiler() is None:
+        pytest.skip('no C compiler on this machine')
+    monkeypatch.setenv('CG_CACHE', str(tmp_path))
+    monkeypatch.setattr(module, '_built', {})
+    first = compile_model(bare, Setup())
+    assert compile_model(bare.with_values({'c1': 0.12}), Setup()) is first
+    (library,) = tmp_path.glob('*.so')
+    stamp = library.stat().st_mtime_ns
+    monkeypatch.setattr(module, '_built', {})
+    compile_model(bare, Setup())
+    assert library.stat().st_mtime_ns == stamp
+    compile_model(bare, Setup(stance='outer'))
+    assert len(list(tmp_path.glob('*.so'))) == 2
+
+
+def test_too_many_unknowns_are_refused(bare):
+    compiled, p = compile_model(bare, Setup()), parameter_vector(bare, Setup())
+    with pytest.raises(ValueError, match='at most 64'):
+        compiled.normal(
+            TIME, TORQUE, np.zeros(4), np.zeros((4, 65)), p, np.full(len(compiled.free), -1),
+            np.zeros((len(TIME), 3)), np.ones(3),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize('lump', ['c1', 'c2', 'c3', 'c4', 'c5', 'c6'])
+def test_every_lump_matters(bare, lump):
+    """What a flipped or dropped term would do: no parameter may be without effect."""
+    x0 = np.array([0.05, 0.12, 0.2, -0.3])
+    changed = bare.with_values({lump: 1.05 * bare.values[lump]})
+    difference = (
+        simulate(changed, Setup(), TIME, TORQUE, x0)[1]
+        - simulate(bare, Setup(), TIME, TORQUE, x0)[1]
+    )
+    assert np.abs(difference).max() > 1e-5
+
+
+def test_torque_of_the_other_sign_moves_the_robot_the_other_way(bare):
+    """Mirror symmetry: the robot upright, motion and torque mirrored, moves mirrored."""
+    x0 = np.array([0.05, 0.12, 0.2, -0.3])
+    right, _ = simulate(bare, Setup(), TIME, TORQUE, x0)
+    left, _ = simulate(bare, Setup(), TIME, -TORQUE, -x0)
+    wrong, _ = simulate(bare, Setup(), TIME, TORQUE, -x0)
+    np.testing.assert_allclose(left, -right, atol=1e-13)
+    assert np.abs(wrong + right).max() > 0.1
+
+
+def test_late_outputs_are_those_of_the_earlier_instant_under_torque_that_jumps(bare, rng):
+    """Between rows an output is a cubic; its slopes belong to the torque that is held there."""
+    torque = np.repeat(rng.normal(0, 5, size=(20, 1)), 10, axis=0)
+    x0 = np.array([0.05, 0.12, 0.2, -0.3])
+    late = simulate(bare.with_effect('sensor_delay', delay=0.0031), Setup(), TIME, torque, x0)[1]
+    fine_time, fine_torque = np.arange(0, 0.4 - 0.0019, 1e-4), np.repeat(torque, 20, axis=0)
+    fine = simulate(bare, Setup(), fine_time, fine_torque[: len(fine_time)], x0)[1]
+    rows = np.arange(2, len(TIME))
+    np.testing.assert_allclose(late[rows], fine[20 * rows - 31], atol=1e-8)
