@@ -58,6 +58,9 @@ def start_nodes(context: LaunchContext) -> list:
             name=name,
             parameters=[file.name],
             output='screen',
+            # A recorder that closes a long bag needs its time.
+            sigterm_timeout='60',
+            sigkill_timeout='60',
         )
         for name, (package, executable) in NODE_MODULES.items()
     }

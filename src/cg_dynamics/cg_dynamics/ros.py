@@ -7,12 +7,14 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
 - `run` makes the node, spins it in one thread until it is told to stop, and always calls its
   `close`, while the context still stands, so that a last zero torque can go out.
 - A node that has something to do between messages has `poll() -> float`: it does what is due
-  and returns in how many s it wants to be asked again.
+  and returns in how many s it wants to be asked again. One that must not lose what is on its way
+  when it is told to stop has `linger`, the s for which it goes on listening.
 """
 
 import dataclasses
 import signal
 import sys
+import time
 import typing
 from collections.abc import Callable
 from typing import Any
@@ -196,6 +198,9 @@ def spin(node: Node, stopped: Callable[[], bool]) -> None:
     while not stopped() and not getattr(node, 'finished', False):
         # A wait without a time-out hangs in this executor.
         executor.spin_once(timeout_sec=min(max(poll(), 0.0), IDLE_POLL))
+    deadline = time.monotonic() + getattr(node, 'linger', 0.0)
+    while time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.01)
     executor.remove_node(node)
 
 

@@ -10,6 +10,7 @@ lockstep    The measurement stamped t goes out, then nothing moves until the com
             that does not answer in time ends the run, with zero torque.
 """
 
+import math
 import time
 from datetime import datetime, timezone
 
@@ -98,6 +99,8 @@ class SimulationNode(LifecycleNode):
         self.plant, self.sensors = plant, sensors
         self.joints = sensors.joints
         self.limit = self.settings.torque_limit or float(model.torque_limit)
+        if math.isinf(self.limit):
+            self.get_logger().warning('the model states no torque limit; nothing is limited')
         gate = GateSettings(torque_limit=self.limit, stale_after=self.settings.stale_after)
         self.gate = TorqueGate(gate, self.joints)
         self.lockstep = self.settings.mode == 'lockstep'

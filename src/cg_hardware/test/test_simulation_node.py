@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
+from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 from cg_hardware.simulation import SimulationSettings  # noqa: E402
@@ -121,6 +122,29 @@ def test_lockstep_bad_commands_never_reach_the_motor(bench, torque, applied):
     machine = bench.machine(mode='lockstep', duration=0.01)
     bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 5)
     assert {m.effort[0] for m in bench.applied} == {applied}
+
+
+@pytest.mark.parametrize(
+    ('model', 'joints'),
+    [('dfki_double_pendulum', ['shoulder', 'elbow']), ('sydney_pendulum', ['joint'])],
+)
+def test_other_mechanisms_speak_joint_states(bench, model, joints):
+    def answer(message):
+        assert message.name == joints
+        assert len(message.position) == len(joints)
+        reply = JointState(name=joints[::-1], effort=[0.1 * k for k in range(len(joints))][::-1])
+        reply.header.stamp = message.header.stamp
+        bench.command.publish(reply)
+
+    bench.controller.create_subscription(JointState, '/joint_states', answer, 10)
+    machine = bench.machine(
+        model_file=str(model_path(model)), mode='lockstep', duration=0.02, exit_when_done=True
+    )
+    bench.until(lambda: machine.finished and len(bench.applied) >= 10)
+    assert machine.exit_status == 0
+    for message in bench.applied:
+        assert message.name == joints
+        assert list(message.effort) == [0.1 * k for k in range(len(joints))]
 
 
 def test_real_time_keeps_its_rate_and_stamps(bench):

@@ -25,6 +25,8 @@ READY_PERIOD = 0.02  # s
 class RecorderNode(Node):
     """Records the topics of one machine."""
 
+    linger = 0.1  # s; messages that were sent before the order to stop are still stored
+
     def __init__(self, **kwargs):
         super().__init__('recorder', **kwargs)
         self.finished = False
