@@ -46,7 +46,7 @@ supported "$python" ||
     fail "$python is Python $(version "$python" || echo '(broken)'), needed is 3.10 to 3.13; set PYTHON=..."
 "$python" -c 'import ensurepip, venv' 2>/dev/null ||
     fail "$python cannot make virtual environments; install its venv module (Debian, Ubuntu: apt install python3-venv)."
-[[ -z $ros ]] || "$python" -c 'import rclpy' 2>/dev/null ||
+[[ -z $ros ]] || "$python" -c 'from rclpy.node import Node' 2>/dev/null ||
     fail "ROS_DISTRO=jazzy is set, but $python cannot import rclpy; source Jazzy's setup.bash, or unset ROS_DISTRO."
 
 made_for="$(version "$python") ${ros:-wheels} $PWD"
