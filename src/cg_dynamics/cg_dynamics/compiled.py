@@ -173,7 +173,7 @@ class CompiledModel:
         Raises:
             SimulationError: if the state runs away.
         """
-        time, u, x0, p = (_array(a) for a in (time, u, x0, p))
+        time, u, x0, p = self._checked(time, u, x0, p)
         late, _ = self.delayed_inputs(time, u, self.delays(p)[0])
         late = _array(late)
         states = np.empty((len(time), self.nx))
@@ -190,7 +190,8 @@ class CompiledModel:
         self, time: np.ndarray, u: np.ndarray, states: np.ndarray, p: np.ndarray
     ) -> np.ndarray:
         """What the sensors report at the rows, shape (n, ny), delays included."""
-        time, u, states, p = (_array(a) for a in (time, u, states, p))
+        time, u, _, p = self._checked(time, u, np.zeros(self.nx), p)
+        states = _shaped('states', states, (len(time), self.nx))
         input_delay, output_delays, _ = self.delays(p)
         late = _array(self.delayed_inputs(time, u, input_delay)[0])
         y = np.empty((len(time), self.ny))
@@ -199,6 +200,11 @@ class CompiledModel:
 
     def advance(self, x: np.ndarray, u: np.ndarray, p: np.ndarray, step: float, n: int) -> None:
         """Integrate x in place over n Runge-Kutta steps of `step` s with inputs held."""
+        if x.shape != (self.nx,) or u.shape != (self.nu,) or p.shape != (self.np,):
+            raise ValueError(
+                f'x, u, p have shapes {x.shape}, {u.shape}, {p.shape}; '
+                f'expected ({self.nx},), ({self.nu},), ({self.np},)'
+            )
         self._c.cgm_advance(x, u, p, step, n)
 
     def normal(
@@ -226,13 +232,18 @@ class CompiledModel:
             weight: 1 / standard deviation of each output, shape (ny,).
             keep: Return the simulated outputs and the Jacobian too.
         """
-        time, u, x0, s0, p = (_array(a) for a in (time, u, x0, s0, p))
-        n, nc = len(time), s0.shape[1]
+        time, u, x0, p = self._checked(time, u, x0, p)
+        n, nc = len(time), np.shape(s0)[1]
         if nc > MAX_COLUMNS:
             raise ValueError(f'{nc} unknowns in one record; at most {MAX_COLUMNS}')
+        s0 = _shaped('s0', s0, (self.nx, nc))
+        measured = _shaped('measured', measured, (n, self.ny))
+        weight = _shaped('weight', weight, (self.ny,))
         input_delay, output_delays, jacobian = self.delays(p)
         late, slope = self.delayed_inputs(time, u, input_delay)
         column = np.ascontiguousarray(column, dtype=np.int32)
+        if column.shape != (len(self.free),) or column.max(initial=-1) >= nc:
+            raise ValueError(f'column must place {len(self.free)} parameters below {nc}')
         delay_columns = [_delay_column(row, column) for row in jacobian]
         any_late = self.has_delays and (output_delays.any() or max(delay_columns[1:]) >= 0)
         history = np.empty(n * 2 * self.nx * (1 + nc) if any_late else 1)
@@ -243,12 +254,22 @@ class CompiledModel:
         j = np.zeros((n, self.ny, nc)) if keep else None
         rows = self._c.cgm_normal(
             n, time, self.largest_step, _array(late), _array(slope), delay_columns[0], x0, s0, p,
-            nc, column, _array(measured), _array(weight), _array(output_delays),
+            nc, column, measured, weight, _array(output_delays),
             np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip
         object.__setattr__(normal, 'rows', rows)
         return normal, y, j
+
+    def _checked(self, time, u, x0, p) -> tuple[np.ndarray, ...]:
+        # C reads as many numbers as the model has, whatever it is handed.
+        time = _array(time)
+        return (
+            time,
+            _shaped('u', u, (len(time), self.nu)),
+            _shaped('x0', x0, (self.nx,)),
+            _shaped('p', p, (self.np,)),
+        )
 
 
 def compile_model(model: Model, setup: Setup, free: tuple[str, ...] | None = None) -> CompiledModel:
@@ -295,6 +316,13 @@ def simulate(
 
 def _array(a) -> np.ndarray:
     return np.ascontiguousarray(a, dtype=float)
+
+
+def _shaped(name: str, a, shape: tuple[int, ...]) -> np.ndarray:
+    a = _array(a)
+    if a.shape != shape:
+        raise ValueError(f'{name} has shape {a.shape}, expected {shape}')
+    return a
 
 
 def _pick(equations: Equations, names: tuple[str, ...]) -> ca.SX:

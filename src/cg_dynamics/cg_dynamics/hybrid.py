@@ -181,8 +181,9 @@ def walk(
         stance: Stance leg at the start, 'inner' or 'outer'.
         x0: State at the start: (q_inner, q_outer) and rates, extra states optional.
         duration: In s.
-        command: (time, stance, x) -> torque (nu,), asked every `sample_time` and held; it acts
-            late by the model's input delay. None: no torque.
+        command: (time, stance, x) -> torque (1,), asked every `sample_time` and held; it acts
+            late by the model's input delay. None: no torque. Extra inputs of effects are
+            switches that are on.
         options: How to walk.
 
     Raises:
@@ -207,7 +208,7 @@ class _Walker:
 
     def run(self, stance: str, x: np.ndarray, duration: float) -> Walk:
         compiled = self.compiled[stance]
-        u = np.zeros(compiled.nu)
+        u = self._inputs(0.0)
         if len(x) != compiled.nx:
             x = compiled.initial_state(x[:4], u, self.p)
         leg, arcs, outcome = _Leg(stance, compiled), [], 'time'
@@ -216,8 +217,8 @@ class _Walker:
         t, tick = 0.0, 0
         while t < duration - INSTANT and outcome == 'time':
             if self.command is not None:
-                wanted = np.array(self.command(t, leg.stance, x.copy()), float).reshape(u.shape)
-                latches.append((t + self.delay, wanted))
+                wanted = self.command(t, leg.stance, x.copy())
+                latches.append((t + self.delay, self._inputs(wanted)))
             tick += 1
             end = min(tick * self.options.sample_time, duration)
             while t < end - INSTANT and outcome == 'time':
@@ -237,6 +238,10 @@ class _Walker:
                     x, self.scuffed = event.impact.x_plus.copy(), False
         leg.add(t, x, u)
         return Walk((*arcs, leg.arc()), tuple(self.events), outcome)
+
+    def _inputs(self, torque) -> np.ndarray:
+        extra = self.compiled['inner'].nu - 1
+        return np.concatenate([np.array(torque, float).reshape(1), np.ones(extra)])
 
     def _outcome(self, event: Event) -> str:
         if event.kind == 'fall' or (event.kind == 'scuff' and self.options.stop_on_scuff):

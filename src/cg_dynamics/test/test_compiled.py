@@ -32,18 +32,19 @@ def jacobian_and_differences(model, setup, backend=None):
     if backend is not None:
         compiled = CompiledModel(compiled.equations, compiled.free, None)
     p = parameter_vector(model, setup)
+    torque = np.hstack([TORQUE, np.ones((len(TIME), compiled.nu - 1))])
     motion = start(compiled, p)
     m2, nf = len(motion), len(compiled.free)
 
     def outputs(motion, p):
-        x0 = compiled.initial_state(motion, TORQUE[0], p)
-        return compiled.outputs(TIME, TORQUE, compiled.simulate(TIME, TORQUE, x0, p), p)
+        x0 = compiled.initial_state(motion, torque[0], p)
+        return compiled.outputs(TIME, torque, compiled.simulate(TIME, torque, x0, p), p)
 
-    x0, by_motion, by_free = compiled.initial_sensitivity(motion, TORQUE[0], p)
+    x0, by_motion, by_free = compiled.initial_sensitivity(motion, torque[0], p)
     s0, column = np.hstack([by_motion, by_free]), np.arange(m2, m2 + nf)
     measured = np.zeros((len(TIME), compiled.ny))
     normal, y, J = compiled.normal(
-        TIME, TORQUE, x0, s0, p, column, measured, np.ones(compiled.ny), keep=True
+        TIME, torque, x0, s0, p, column, measured, np.ones(compiled.ny), keep=True
     )
     np.testing.assert_allclose(y, outputs(motion, p), atol=1e-12)
     differences = np.empty_like(J)
@@ -173,6 +174,16 @@ def test_library_is_built_once_and_found_again(bare, tmp_path, monkeypatch):
     assert library.stat().st_mtime_ns == stamp
     compile_model(bare, Setup(stance='outer'))
     assert len(list(tmp_path.glob('*.so'))) == 2
+
+
+def test_arrays_of_wrong_shape_are_refused(bare):
+    compiled, p = compile_model(bare, Setup()), parameter_vector(bare, Setup())
+    good = {'time': TIME, 'u': TORQUE, 'x0': np.zeros(4), 'p': p}
+    for name, wrong in (('u', TORQUE[:-1]), ('x0', np.zeros(3)), ('p', p[:-1])):
+        with pytest.raises(ValueError, match=rf'^{name} has shape .*, expected'):
+            compiled.simulate(**(good | {name: wrong}))
+    with pytest.raises(ValueError, match='x, u, p have shapes'):
+        compiled.advance(np.zeros(4), np.zeros(2), p, 0.001, 1)
 
 
 def test_too_many_unknowns_are_refused(bare):

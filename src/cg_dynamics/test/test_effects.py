@@ -17,12 +17,19 @@ TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME))[:, None]
 START = np.array([0.05, 0.1, 0.2, -0.3])
 
 
+def torque_of(model, torque=TORQUE):
+    """Inputs of a model: torque, and its extra ones switched on."""
+    extra = compile_model(model, Setup()).nu - 1
+    return np.hstack([torque, np.ones((len(torque), extra))])
+
+
 def right_side(model, setup=None):
     setup = setup or Setup()
     e = assemble(model, setup)
     f = ca.Function('f', [e.x, e.u, e.p], [e.rates, e.outputs])
     p = parameter_vector(model, setup)
-    return lambda x, u: [np.asarray(result).ravel() for result in f(x, u, p)]
+    on = np.ones(e.u.shape[0] - 1)
+    return lambda x, u: [np.asarray(result).ravel() for result in f(x, [u, *on], p)]
 
 
 @pytest.mark.parametrize('name', LIBRARY)
@@ -42,7 +49,7 @@ def test_effect_is_declared_completely(name):
 def test_effect_at_its_neutral_value_is_not_there(bare, name, site):
     first = LIBRARY[name].parameters[0]
     neutral = bare.with_effect(name, at=site, **{first.name: first.neutral})
-    states, outputs = simulate(neutral, Setup(), TIME, TORQUE, START)
+    states, outputs = simulate(neutral, Setup(), TIME, torque_of(neutral), START)
     plain_states, plain_outputs = simulate(bare, Setup(), TIME, TORQUE, START)
     np.testing.assert_array_equal(states, plain_states)
     np.testing.assert_array_equal(outputs, plain_outputs)
@@ -65,7 +72,8 @@ def test_formula_of_the_effect_vanishes_at_the_neutral_value(bare, name, site, m
 
 @pytest.mark.parametrize(('name', 'site'), EVERYWHERE)
 def test_effect_at_its_default_changes_something(bare, name, site):
-    changed = simulate(bare.with_effect(name, at=site), Setup(), TIME, TORQUE, START)[1]
+    model = bare.with_effect(name, at=site)
+    changed = simulate(model, Setup(), TIME, torque_of(model), START)[1]
     plain = simulate(bare, Setup(), TIME, TORQUE, START)[1]
     assert np.abs(changed - plain).max() > 1e-7
 

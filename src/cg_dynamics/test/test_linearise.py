@@ -32,7 +32,7 @@ def test_jacobians_agree_with_differences_under_every_effect(bare, name):
     model = bare.with_effect(name)
     compiled = compile_model(model, Setup())
     p = parameter_vector(model, Setup())
-    u = np.array([2.0])
+    u = np.array([2.0, 0.7])[: compiled.nu]
     x = np.concatenate([[0.1, -0.2, 0.3, 0.35], np.zeros(compiled.nx - 4)])
     x[4:] = compiled.initial_state(x[:4], u, p)[4:]
     found = linearise(model, Setup(), x, u)
@@ -43,8 +43,9 @@ def test_jacobians_agree_with_differences_under_every_effect(bare, name):
             d[j] = h
             slope = np.asarray(function(x + d, u, p) - function(x - d, u, p)) / (2 * h)
             np.testing.assert_allclose(by_x[:, j], slope.ravel(), rtol=1e-5, atol=1e-6)
-        slope = np.asarray(function(x, u + h, p) - function(x, u - h, p)) / (2 * h)
-        np.testing.assert_allclose(by_u, slope, rtol=1e-6, atol=1e-7)
+        for j, d in enumerate(h * np.eye(compiled.nu)):
+            slope = np.asarray(function(x, u + d, p) - function(x, u - d, p)) / (2 * h)
+            np.testing.assert_allclose(by_u[:, j], slope.ravel(), rtol=1e-5, atol=1e-7)
 
 
 def test_eq_4_8_and_4_9_hold_at_the_upright_equilibrium(bare):
