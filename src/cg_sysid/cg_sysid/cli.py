@@ -1,0 +1,181 @@
+"""What the command lines share: one-line errors, progress, tables."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from cg_dynamics.model import Model
+from cg_sysid.bags import parse_note
+from cg_sysid.text import effect_name, measured, number, plain_unit
+
+BAD_INPUT = 2
+UNUSABLE = 1
+INTERRUPTED = 130
+
+Facts = dict[str, Any]
+
+
+class Bars(AbstractContextManager):
+    """Progress of several pieces of work on stderr; silent where nobody watches.
+
+    Args:
+        quiet: Say nothing even on a terminal.
+    """
+
+    def __init__(self, quiet: bool = False):
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn('{task.description}'),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=quiet or not console.is_terminal,
+        )
+        self._tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> 'Bars':
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Note that `done` of `total` pieces are finished."""
+        if what not in self._tasks:
+            self._tasks[what] = self._progress.add_task(what, total=total)
+        task = self._tasks[what]
+        self._progress.update(task, completed=done, total=total)
+        if done >= total:
+            # The next round may bear the same name.
+            self._progress.remove_task(self._tasks.pop(what))
+
+
+def run(program: str, work: Callable[[argparse.Namespace], int], options) -> int:
+    """Do the work; turn what a user can cause into one line on stderr.
+
+    Args:
+        program: Name of the program.
+        work: Takes the options, returns the exit code.
+        options: Parsed options.
+    """
+    try:
+        return work(options)
+    except (ValueError, OSError) as error:
+        print(f'{program}: error: {one_line(error)}', file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f'{program}: interrupted', file=sys.stderr)
+        return INTERRUPTED
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error without line breaks."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f'{error.filename}: {error.strerror}'
+    return ' '.join(str(error).split()) or type(error).__name__
+
+
+def common_options(parser: argparse.ArgumentParser) -> None:
+    """Options of every program that analyses bags."""
+    parser.add_argument('bags', nargs='+', metavar='BAG', help='recordings: bag directories')
+    parser.add_argument('--model', required=True, metavar='FILE', help='model file (YAML)')
+    parser.add_argument(
+        '--out', required=True, type=Path, metavar='DIR',
+        help='directory for the results; files of an earlier run in it are replaced',
+    )  # fmt: skip
+    parser.add_argument(
+        '--window', type=float, metavar='SECONDS', help='cut every record into windows'
+    )
+    parser.add_argument(
+        '--note', metavar='FILE', help='recording note (YAML) for bags that carry none'
+    )
+    parser.add_argument(
+        '--input', choices=('applied', 'command'), dest='torque',
+        help='torque that the model is driven with [applied, or the command where there is none]',
+    )  # fmt: skip
+    parser.add_argument('--date', help='ISO 8601 date to put into the results [now]')
+    parser.add_argument('--quiet', action='store_true', help='no progress bars, no tables')
+
+
+def load_note(path: str | None) -> dict[str, Any] | None:
+    """The recording note of a file; None if no file is named."""
+    return parse_note(Path(path).read_text('utf-8'), path) if path else None
+
+
+def load_model(path: str) -> Model:
+    """The model of a file, with an error that fits on one line."""
+    return Model.load(path)
+
+
+def prepare_directory(path: Path) -> None:
+    """Create the directory of the results.
+
+    Raises:
+        ValueError: It is a file.
+    """
+    if path.exists() and not path.is_dir():
+        raise ValueError(f'--out {path}: a file is in the way; name a directory')
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def print_gain(console: Console, facts: Facts) -> None:
+    """Table of the error before and after, beside the noise."""
+    if not facts['gain']:
+        return
+    table = Table('output', 'before', 'after', 'noise floor', 'unit', 'better by', box=None,
+                  pad_edge=False, header_style='bold')  # fmt: skip
+    for column in table.columns[1:4]:
+        column.justify = 'right'
+    for channel, gain in facts['gain'].items():
+        table.add_row(
+            channel, *(number(gain[k]) for k in ('before', 'after', 'noise_floor')),
+            plain_unit(gain['unit']), f'{gain["ratio"]:.3g} x' if gain['ratio'] else '',
+        )  # fmt: skip
+    console.print(table)
+
+
+def print_causes(console: Console, facts: Facts) -> None:
+    """The named causes with their numbers."""
+    for cause in facts['causes']:
+        numbers = ', '.join(
+            f'{name} = {measured(p["value"], p["sigma"], p["unit"])}'
+            for name, p in cause['parameters'].items()
+        )
+        strength = cause['evidence_nats']
+        strength = f'  (evidence {strength:.0f} nats)' if strength is not None else ''
+        console.print(f'  [bold]{effect_name(cause["label"])}[/]: {numbers}{strength}')
+        for rival in cause['rivals']:
+            console.print(f'    or: {effect_name(rival["label"])}')
+        if cause['places']:
+            console.print(f'    or elsewhere: {", ".join(cause["places"])}')
+
+
+def print_left_out(facts: Facts) -> None:
+    """One line on stderr for each bag that is not used."""
+    for entry in facts['unusable']:
+        print(f'left out {entry["source"]}: {one_line(ValueError(entry["reason"]))}',
+              file=sys.stderr)  # fmt: skip
+
+
+def print_findings(console: Console, findings: Sequence[str], most: int = 8) -> None:
+    """Warnings, the first few."""
+    for finding in findings[:most]:
+        console.print(f'  [yellow]note[/] {finding}')
+    if len(findings) > most:
+        console.print(f'  [yellow]note[/] and {len(findings) - most} more in the report')

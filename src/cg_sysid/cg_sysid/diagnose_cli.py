@@ -1,0 +1,225 @@
+"""Command line: what does my simulation get wrong about these recordings, and why?
+
+    diagnose --model MODEL.yaml --out DIR BAG [BAG ...]
+
+Writes DIR/diagnosis.json, DIR/report.html, DIR/curves.npz and, where records could be used,
+DIR/model.yaml: the model with the causes in it.
+"""
+
+import argparse
+import fnmatch
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from cg_dynamics.model import Model
+from cg_sysid import cli, curves
+from cg_sysid.diagnose import Diagnosis, Options, diagnose
+from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
+from cg_sysid.intake import Intake, take_in
+from cg_sysid.provenance import provenance
+from cg_sysid.record import Record
+from cg_sysid.report import write_report
+
+COLOURS = {
+    'consistent': 'green', 'explained': 'green', 'ambiguous': 'yellow', 'unexplained': 'magenta',
+    'unusable': 'red',
+}  # fmt: skip
+EPILOG = """\
+verdicts:
+  consistent    the model explains the recordings down to the noise of the sensors
+  explained     named causes are missing from the model
+  ambiguous     causes that these recordings cannot tell apart
+  unexplained   something is missing that no effect of the library explains
+  unusable      the recordings themselves are broken (exit code 1)
+
+exit code 0 with an answer, 1 if the recordings are unusable, 2 for a wrong argument
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = argparse.ArgumentParser(
+        prog='diagnose',
+        description='Say what a simulation gets wrong about recordings, name the cause, and '
+        'show how much better the model is with that cause in it.',
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    cli.common_options(made)
+    made.add_argument(
+        '--effects', metavar='A,B', help='try only these effects [the whole library]'
+    )
+    made.add_argument(
+        '--rounds', type=int, default=Options.rounds, help='most effects to add [%(default)s]'
+    )
+    made.add_argument('--workers', type=int, help='local processes [one per core]')
+    made.add_argument(
+        '--held', '--hold-out', metavar='GLOB',
+        help="records to judge on, by name, such as 'spring*_2' [every second of each set-up]",
+    )  # fmt: skip
+    return made
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run('diagnose', work, parser().parse_args(args))
+
+
+def work(options: argparse.Namespace) -> int:
+    """Read, check, diagnose, write."""
+    if options.rounds < 1:
+        raise ValueError(f'--rounds is {options.rounds}; at least 1 is needed')
+    if options.workers is not None and options.workers < 0:
+        raise ValueError(f'--workers is {options.workers}; it must not be negative')
+    model = cli.load_model(options.model)
+    note = cli.load_note(options.note)
+    with cli.Bars(options.quiet) as bars:
+        intake = take_in(
+            options.bags, options.model, note, options.torque, options.window, bars
+        )
+        _same_mechanism(model, intake.records)
+        origin = provenance(
+            options.model,
+            ['diagnose', *_command(options)],
+            {
+                'effects': options.effects or 'all', 'rounds': options.rounds,
+                'window_s': options.window, 'held': options.held or 'automatic',
+                'input': options.torque or 'automatic', 'note': options.note,
+            },
+            options.date,
+        )  # fmt: skip
+        if _too_few(intake):
+            facts, lines = unusable_facts(model, intake, _why(intake), origin), []
+            answer = None
+        else:
+            answer = diagnose(
+                model, intake.records, _options(options, intake), bars
+            )
+            facts = diagnosis_facts(answer, intake, origin)
+            lines = diagnosis_curves(answer)
+        cli.prepare_directory(options.out)
+        bars('writing the report', 0, 1)
+        write_results(options.out, facts, lines, answer)
+        bars('writing the report', 1, 1)
+    cli.print_left_out(facts)
+    show(Console(), facts, options.out, options.quiet)
+    return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
+
+
+def _command(options: argparse.Namespace) -> list[str]:
+    words = ['--model', options.model, '--out', str(options.out)]
+    for name, value in (
+        ('--effects', options.effects), ('--held', options.held), ('--window', options.window),
+        ('--note', options.note), ('--input', options.torque), ('--workers', options.workers),
+    ):  # fmt: skip
+        words += [] if value is None else [name, str(value)]
+    if options.rounds != Options.rounds:
+        words += ['--rounds', str(options.rounds)]
+    return [*words, *options.bags]
+
+
+def _same_mechanism(model: Model, records: Sequence[Record]) -> None:
+    for record in records:
+        if record.mechanism != model.mechanism.name:
+            raise ValueError(
+                f'{record.source}: recorded on a {record.mechanism}, but the model '
+                f'{model.name!r} is of a {model.mechanism.name}'
+            )
+
+
+def _too_few(intake: Intake) -> bool:
+    # One good record alone is not enough either, but then it is not the recordings' fault.
+    return not intake.records or (len(intake.records) == 1 and bool(intake.left_out))
+
+
+def _why(intake: Intake) -> str:
+    total, bad = len(intake.sources), len(intake.left_out)
+    if bad == total:
+        which = 'The recording is' if total == 1 else f'All {total} recordings are'
+    else:
+        which = f'{bad} of {total} recordings {"is" if bad == 1 else "are"}'
+    first = intake.left_out[0]
+    return f'{which} broken, and nothing was fitted. {first.name}: {first.reason}.'
+
+
+def _options(options: argparse.Namespace, intake: Intake) -> Options:
+    effects = tuple(e.strip() for e in options.effects.split(',')) if options.effects else None
+    held = None
+    if options.held:
+        names = [record.name for record in intake.records]
+        held = tuple(n for n in names if fnmatch.fnmatchcase(n, options.held))
+        if not held or len(held) == len(names):
+            raise ValueError(
+                f'--held {options.held!r} matches {"no" if not held else "every"} record; '
+                f'there are: {", ".join(names)}'
+            )
+    return Options(effects=effects, rounds=options.rounds, workers=options.workers, held=held)
+
+
+def diagnosis_curves(answer: Diagnosis) -> list[curves.Curve]:
+    """Measured and simulated signals of every record, those held out first."""
+    before, after = answer.baseline, answer.extended
+    found = []
+    for role, trials, a, b in (
+        ('held', answer.held, before.held, after.held),
+        ('train', answer.train, before.train, after.train),
+    ):
+        for k, trial in enumerate(trials):
+            found.append(
+                curves.make_curve(
+                    trial, role, before.model, a.motions[k], after.model, b.motions[k]
+                )
+            )
+    return found
+
+
+def write_results(
+    directory: Path, facts: Facts, lines: list[curves.Curve], answer: Diagnosis | None
+) -> None:
+    """Everything that a diagnosis leaves behind."""
+    write_facts(facts, directory)
+    curves.save(lines, directory)
+    if answer is not None:
+        extended_model(answer, facts).save(directory / 'model.yaml')
+    else:
+        (directory / 'model.yaml').unlink(missing_ok=True)
+    write_report(directory)
+
+
+def extended_model(answer: Diagnosis, facts: Facts) -> Model:
+    """The model with the causes in it; its provenance says where it comes from."""
+    origin = facts['provenance']
+    return replace(
+        answer.extended.train.model,
+        provenance={
+            'made_by': 'diagnose',
+            'created': origin['created'],
+            'parent': Path(origin['model_file']).name,
+            'parent_sha256': origin['model_sha256'],
+            'verdict': answer.verdict,
+            'causes': [cause.label for cause in answer.causes],
+            'records': [
+                {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']
+            ],
+            'parent_provenance': dict(answer.nominal.provenance),
+        },
+    )
+
+
+def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
+    """Print the answer for people."""
+    verdict = facts['verdict']
+    console.print(f'[bold {COLOURS[verdict]}]{verdict}[/]  {facts["summary"]}', highlight=False)
+    if not quiet:
+        cli.print_causes(console, facts)
+        cli.print_gain(console, facts)
+        cli.print_findings(console, facts['findings'])
+    console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

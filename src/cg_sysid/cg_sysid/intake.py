@@ -1,0 +1,176 @@
+"""From bags on the command line to records that may be analysed, and what became of each bag."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cg_sysid.bags import read_raw, to_record
+from cg_sysid.check import check_recording
+from cg_sysid.errors import RecordingError
+from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.record import Record
+
+TORQUE_TOPICS = {'applied': '/applied_torque', 'command': '/torque_command'}
+SHORTEST_WINDOW = 0.5  # s; less holds no motion to compare
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One bag and what became of it.
+
+    Attributes:
+        name: Name of the bag.
+        path: As it was given.
+        sha256: Hash over its storage files; empty where there is none to read.
+        check: What the check says.
+        reason: Why it was left out; empty if it is used.
+    """
+
+    name: str
+    path: str
+    sha256: str
+    check: CheckReport
+    reason: str = ''
+
+    @property
+    def faults(self) -> tuple[Finding, ...]:
+        """The findings that make it unusable."""
+        return tuple(f for f in self.check.findings if f.severity == 'error')
+
+
+@dataclass(frozen=True)
+class Intake:
+    """What a set of bags gave.
+
+    Attributes:
+        records: Records (or windows of them) to be analysed.
+        sources: Every bag, used or not.
+        origin: Name of a record -> name of the bag that it is from.
+    """
+
+    records: tuple[Record, ...]
+    sources: tuple[Source, ...]
+    origin: Mapping[str, str]
+
+    @property
+    def left_out(self) -> tuple[Source, ...]:
+        """The bags that are not used."""
+        return tuple(source for source in self.sources if source.reason)
+
+
+def take_in(
+    bags: Sequence[str | Path],
+    model_file: str | Path | None = None,
+    note: Mapping[str, Any] | None = None,
+    torque: str | None = None,
+    window: float | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> Intake:
+    """Read and check bags; broken ones are left out, with the reason.
+
+    Args:
+        bags: Paths of bags.
+        model_file: Model file that they will be used with.
+        note: Recording note for bags that carry none.
+        torque: `applied` or `command`; by default the applied torque where there is one.
+        window: Cut records into windows of this length in s.
+        progress: Called with (what, done, total).
+
+    Raises:
+        RecordingError: A path is no bag at all, is given twice, or a window is too short.
+    """
+    if window is not None and not window >= SHORTEST_WINDOW:
+        raise RecordingError(f'window is {window:g} s; at least {SHORTEST_WINDOW:g} s are needed')
+    paths = _distinct(bags)
+    sources: list[Source] = []
+    records: list[Record] = []
+    origin: dict[str, str] = {}
+    for done, (name, path) in enumerate(paths.items()):
+        progress('reading and checking bags', done, len(paths))
+        source, record = _take(name, path, model_file, note, torque)
+        sources.append(source)
+        if record is None:
+            continue
+        pieces = record.segments(window) if window and record.duration > window else [record]
+        records += pieces
+        origin |= {piece.name: name for piece in pieces}
+    progress('reading and checking bags', len(paths), len(paths))
+    return Intake(tuple(records), tuple(sources), origin)
+
+
+def _distinct(bags: Sequence[str | Path]) -> dict[str, Path]:
+    """Short name -> path; a name that two bags share gets its directory in front."""
+    paths = [Path(bag) for bag in bags]
+    for path in paths:
+        if not path.exists():
+            raise RecordingError(f'{path}: no such bag')
+        if not _storage(path):
+            raise RecordingError(f'{path}: not a bag (no .mcap or .db3 file in it)')
+    resolved = [path.resolve() for path in paths]
+    for path, place in zip(paths, resolved, strict=True):
+        if resolved.count(place) > 1:
+            raise RecordingError(f'{path}: given twice')
+    names = [place.name for place in resolved]
+    return {
+        name if names.count(name) == 1 else f'{place.parent.name}/{name}': path
+        for name, place, path in zip(names, resolved, paths, strict=True)
+    }
+
+
+def _storage(path: Path) -> list[Path]:
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    # A recorder that was killed leaves .mcap.active; the check says how to recover it.
+    return [f for f in files if f.is_file() and {'.mcap', '.db3'} & set(f.suffixes)]
+
+
+def _take(
+    name: str,
+    path: Path,
+    model_file: str | Path | None,
+    note: Mapping[str, Any] | None,
+    torque: str | None,
+) -> tuple[Source, Record | None]:
+    digest = bag_hash(path)
+    try:
+        raw = read_raw(path, note)
+        report = check_recording(raw, model_file)
+        record = None
+        if report.verdict != 'unusable':
+            record = to_record(raw, TORQUE_TOPICS[torque] if torque else None)
+    except RecordingError as error:
+        finding = Finding('unreadable', 'error', '', _without_path(str(error), path))
+        return Source(name, str(path), digest, make_report(name, [finding]), finding.message), None
+    if record is None:
+        return Source(name, str(path), digest, report, _reason(report)), None
+    return Source(name, str(path), digest, report), _named(record, name)
+
+
+def _without_path(message: str, path: Path) -> str:
+    return message.removeprefix(f'{path}: ')
+
+
+def _named(record: Record, name: str) -> Record:
+    return record if record.name == name else replace(record, name=name)
+
+
+def _reason(report: CheckReport) -> str:
+    """The gravest fault in one line."""
+    fault = report.findings[0]
+    more = sum(f.severity == 'error' for f in report.findings) - 1
+    where = ' '.join(part for part in (fault.where, fault.place) if part)
+    text = f'{where}: {fault.message}' if where else fault.message
+    return f'{text} (and {more} more)' if more else text
+
+
+def bag_hash(path: str | Path) -> str:
+    """SHA-256 over the storage files of a bag, in the order of their names."""
+    digest = hashlib.sha256()
+    for file in _storage(Path(path)):
+        with file.open('rb') as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

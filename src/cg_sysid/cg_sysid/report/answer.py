@@ -1,0 +1,198 @@
+"""First part of the page: verdict, causes, gain."""
+
+import math
+
+from cg_sysid.report.markup import Markup, tag
+from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, parameter_words
+from cg_sysid.text import effect_name, listed, number, scaled, sentence
+
+PLACES = {
+    'command': '; it acts on the way of the command',
+    'transmission': '; it acts in the transmission',
+    'joint': '; it acts at the joint',
+    'body': '; it acts on a body',
+    'environment': '; it acts from the environment',
+    'impact': '; it acts at impact',
+    'sensor': '; it acts in a sensor',
+    'timing': '; it acts on the timing',
+}
+
+
+def answer(facts: Facts) -> Markup:
+    """The answer in words, the causes and the gain."""
+    verdict = facts['verdict']
+    left = [
+        *[_cause(cause) for cause in facts['causes']],
+        _faults(facts),
+        _left_out(facts),
+        _notes(facts),
+    ]
+    left = [part for part in left if part is not None]
+    right = gain(facts)
+    both = bool(left) and right is not None
+    return tag('div',
+        tag('span', verdict, class_='verdict', title=VERDICTS[verdict]),
+        tag('h1', sentence(headline(facts))),
+        tag('p', lead(facts), class_='lead'),
+        tag('div', tag('div', left) if left else None, right,
+            class_='columns' if both else 'columns one'),
+        class_=f'hero {verdict}', id='answer',
+    )  # fmt: skip
+
+
+def _cause(cause: Facts) -> Markup:
+    where = f' at {cause["at"]}' if cause['at'] else ''
+    evidence = cause['evidence_nats']
+    proof = (
+        f'Evidence {number(evidence)} nats over the model without it'
+        if evidence is not None
+        else 'Without it the model cannot follow the recordings at all'
+    )
+    return tag('div',
+        tag('h3', sentence(effect_name(cause['name'])), where),
+        [tag('p', words, class_='big') for words in parameter_words(cause['parameters'])],
+        tag('p', cause['description'], class_='soft'),
+        tag('p', f'{proof}{PLACES.get(cause["place"], "")}.', class_='soft small'),
+        [tag('div', tag('b', 'Could also be ', effect_name(r['label'])),
+             tag('p', r['description'], class_='soft small'), class_='rival')
+         for r in cause['rivals']],
+        tag('div', tag('b', 'Could also act elsewhere: '),
+            listed([effect_name(p) for p in cause['places']], 'or'), class_='rival')
+        if cause['places'] else None,
+        class_='card',
+    )  # fmt: skip
+
+
+def _faults(facts: Facts) -> Markup | None:
+    """Where the recordings are broken, if that is the story."""
+    if facts['verdict'] != 'unusable':
+        return None
+    parts = []
+    for source in facts['sources']:
+        errors = [f for f in source['findings'] if f['severity'] == 'error']
+        if source['used']:
+            continue
+        parts.append(tag('h3', source['name']))
+        for f in errors:
+            where = ', '.join(w for w in (f['where'], f['place']) if w)
+            parts.append(tag('div',
+                tag('b', where or 'the whole recording'),
+                tag('p', sentence(f['message']), '.'),
+                tag('span', f['code'], class_='mono soft'),
+                class_='fault',
+            ))  # fmt: skip
+    used = [s['name'] for s in facts['sources'] if s['used']]
+    if used:
+        parts.append(tag('p', 'Fit for use: ', listed(used), '. A diagnosis needs at least two '
+                         'recordings, one to fit and one to judge.', class_='soft'))  # fmt: skip
+    return tag('div', parts, class_='card')
+
+
+def _left_out(facts: Facts) -> Markup | None:
+    if facts['verdict'] == 'unusable' or not facts['unusable']:
+        return None
+    return tag('div',
+        tag('h3', 'Left out'),
+        tag('p', 'These recordings are broken; the answer stands on the others.', class_='soft'),
+        [tag('div', tag('b', u['name']), tag('p', sentence(u['reason'])), class_='fault')
+         for u in facts['unusable']],
+        class_='card',
+    )  # fmt: skip
+
+
+def _notes(facts: Facts) -> Markup | None:
+    if not facts['findings']:
+        return None
+    notes = facts['findings']
+    items = tag('ul', [tag('li', note) for note in notes], class_='notes small')
+    if len(notes) > 4:
+        items = tag('details', tag('summary', f'{len(notes)} remarks on the fit'), items)
+        return tag('div', items, class_='card')
+    return tag('div', tag('h3', 'Worth knowing'), items, class_='card')
+
+
+def gain(facts: Facts) -> Markup | None:
+    """Error before and after in multiples of the noise, on a logarithmic scale."""
+    rows = {c: g for c, g in facts['gain'].items() if g['noise_floor'] and g['after'] is not None}
+    if not rows:
+        return None
+    changed = any(_changed(g) for g in rows.values())
+    ratios = [
+        g[k] / g['noise_floor'] for g in rows.values() for k in ('before', 'after') if g[k]
+    ]
+    low = min(0.5, 0.8 * min(ratios))
+    high = max(20.0, 1.5 * max(ratios))
+    ticks = _ticks(low, high)
+
+    def at(ratio: float) -> str:
+        share = (math.log(ratio) - math.log(low)) / (math.log(high) - math.log(low))
+        return f'{100 * min(max(share, 0.0), 1.0):.2f}%'
+
+    cells = []
+    for channel, g in rows.items():
+        cells += [_name(channel, g), _dumbbell(g, at, ticks), _values(g)]
+    held = facts['verdict'] != 'identified'
+    title = 'Error on held-out recordings' if held else 'Error on all recordings'
+    legend = [_key('after', 'after' if changed else 'simulated'), _key('floor', 'sensor noise')]
+    if changed:
+        before = 'before (identified anew)' if held else 'before (as given)'
+        legend.insert(0, _key('before', before))
+    return tag('div',
+        tag('h3', title),
+        tag('div', legend, class_='legend'),
+        tag('div', cells,
+            tag('div'), tag('div', [tag('span', f'{t:g}', style=f'left:{at(t)}') for t in ticks],
+                            class_='scale'), tag('div'),
+            tag('div', 'error / sensor noise', class_='axis'),
+            class_='gain'),
+        class_='card',
+    )  # fmt: skip
+
+
+def _key(kind: str, text: str) -> Markup:
+    return tag('span', tag('i', class_=f'k-{kind}'), text)
+
+
+def _changed(g: Facts) -> bool:
+    return g['before'] is not None and abs(g['before'] - g['after']) > 1e-3 * g['after']
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
+    every = 1 if last - first < 5 else 2
+    return [10.0**k for k in range(first, last + 1) if k % every == 0]
+
+
+def _dumbbell(g: Facts, at, ticks: list[float]) -> Markup:
+    noise = g['noise_floor']
+    after = at(g['after'] / noise)
+    marks = [
+        *[tag('i', class_='tick', style=f'left:{at(t)}') for t in ticks],
+        tag('i', class_='unit', style=f'left:{at(1.0)}'),
+    ]
+    if _changed(g):
+        before = at(g['before'] / noise)
+        ends = sorted((float(before[:-1]), float(after[:-1])))
+        marks += [
+            tag('i', class_='stem', style=f'left:{ends[0]}%;width:{ends[1] - ends[0]:.2f}%'),
+            tag('i', class_='dot', style=f'left:{before}'),
+        ]
+    marks.append(tag('i', class_='dot to', style=f'left:{after}'))
+    return tag('div', marks, class_='track')
+
+
+def _values(g: Facts) -> Markup:
+    factor, unit = scaled(max(g['after'], g['before'] or 0.0), g['unit'])
+    text = f'{number(g["after"] * factor)} {unit}'
+    if _changed(g):
+        text = f'{number(g["before"] * factor)} \u2192 {text}'
+    note = None
+    if _changed(g) and g['ratio'] and g['ratio'] > 1.05:
+        note = tag('small', f'{number(g["ratio"], 2)}\u00d7 smaller')
+    return tag('div', text, note, class_='value')
+
+
+def _name(channel: str, g: Facts) -> Markup:
+    factor, unit = scaled(g['noise_floor'], g['unit'])
+    noise = f'noise {number(g["noise_floor"] * factor, 2)} {unit}'
+    return tag('div', channel, tag('small', noise), class_='name')

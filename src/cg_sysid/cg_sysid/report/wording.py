@@ -1,0 +1,112 @@
+"""What the page says in words."""
+
+from typing import Any
+
+from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
+
+Facts = dict[str, Any]
+
+VERDICTS = {
+    'consistent': 'The model explains the recordings down to the noise of the sensors.',
+    'explained': 'Named causes account for the error.',
+    'ambiguous': 'Several causes explain these recordings equally well.',
+    'unexplained': 'Something is missing that no known effect explains.',
+    'unusable': 'The recordings themselves are broken.',
+    'identified': 'Parameters of the model as given, fitted to the recordings.',
+}
+FIXTURES = {
+    'inner_fixed': 'inner legs fixed', 'outer_fixed': 'outer legs fixed', 'legs_tied': 'legs tied',
+}  # fmt: skip
+
+
+def headline(facts: Facts) -> str:
+    """The verdict in a few words."""
+    verdict, causes = facts['verdict'], facts['causes']
+    if verdict == 'consistent':
+        return 'The simulation agrees with the recordings'
+    if verdict == 'explained':
+        names = listed([effect_name(c['label']) for c in causes])
+        return f'The simulation lacks {names}'
+    if verdict == 'ambiguous':
+        parts = [
+            listed([effect_name(x['label']) for x in (c, *c['rivals'])], 'or') for c in causes
+        ]
+        return f'The simulation lacks {"; and ".join(parts)}'
+    if verdict == 'unexplained':
+        worst = worst_channel(facts)
+        at = f' in {worst}' if worst else ''
+        return f'There is an error{at} that no known effect explains'
+    if verdict == 'unusable':
+        bad, total = len(facts['unusable']), len(facts['sources'])
+        if bad == total:
+            return 'The recording is broken' if total == 1 else 'The recordings are broken'
+        return f'{bad} of {total} recordings {"is" if bad == 1 else "are"} broken'
+    count = sum(not p['fixed'] for p in facts['parameters'])
+    return f'{count} parameter{"s" if count != 1 else ""} identified'
+
+
+def lead(facts: Facts) -> str:
+    """One sentence below the headline."""
+    verdict = facts['verdict']
+    if verdict in ('unusable', 'identified') or not facts['gain']:
+        return facts['summary']
+    channel = best_channel(facts)
+    gain = facts['gain'][channel]
+    before, after, noise = gain['before'], gain['after'], gain['noise_floor']
+    factor, unit = scaled(max(before, after), gain['unit'])
+    left = f'{number(after * factor)} {unit} (sensor noise {number(noise * factor, 2)} {unit})'
+    if verdict in ('explained', 'ambiguous'):
+        text = (
+            f'With {"it" if len(facts["causes"]) == 1 else "them"} in the model, the error of '
+            f'{channel} on held-out recordings falls from {number(before * factor)} {unit} to '
+            f'{left}.'
+        )
+        if verdict == 'ambiguous':
+            text += ' These recordings cannot tell the alternatives apart.'
+        above = [c for c, e in facts['remaining_error'].items() if (e['in_noise'] or 0) > 2]
+        if above:
+            text += f' An error above the noise remains in {listed(above)}.'
+        return text
+    if verdict == 'consistent':
+        return f'On held-out recordings the error of {channel} is {left}.'
+    return (
+        f'{sentence(channel)} is simulated with an error of {left} on held-out recordings, and '
+        'nothing in the library of effects removes it.'
+    )
+
+
+def best_channel(facts: Facts) -> str:
+    """The output whose error before is largest beside its noise."""
+    return max(facts['gain'], key=lambda c: _ratio(facts['gain'][c], 'before'))
+
+
+def worst_channel(facts: Facts) -> str | None:
+    """The output whose error after is largest beside its noise."""
+    if not facts['gain']:
+        return None
+    return max(facts['gain'], key=lambda c: _ratio(facts['gain'][c], 'after'))
+
+
+def _ratio(gain: Facts, key: str) -> float:
+    return (gain[key] or 0.0) / (gain['noise_floor'] or 1.0)
+
+
+def setup_words(setup: Facts) -> str:
+    """A set-up in a few words."""
+    words = []
+    if setup.get('fixture', 'none') != 'none':
+        words.append(FIXTURES.get(setup['fixture'], setup['fixture']))
+    else:
+        words.append(f'stance {setup.get("stance", "inner")}')
+    springs = len(setup.get('springs') or ())
+    if springs:
+        words.append(f'{springs} spring{"s" if springs > 1 else ""}')
+    return ', '.join(words)
+
+
+def parameter_words(parameters: Facts) -> list[str]:
+    """`delay 8.01 ± 0.05 ms`, one for each parameter."""
+    return [
+        f'{name.replace("_", " ")} {measured(p["value"], p["sigma"], p["unit"])}'
+        for name, p in parameters.items()
+    ]
