@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
+from cg_dynamics.compiled import CompiledModel, Normal, compile_model
 from cg_dynamics.model import Model
 
 from cg_sysid.trial import Trial
@@ -27,6 +27,7 @@ from cg_sysid.trial import Trial
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
+SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
@@ -78,8 +79,7 @@ class Fit:
         model: The model with the identified values and their standard deviations.
         unknowns: What was identified.
         values: Identified value of each unknown.
-        covariance: Of the unknowns' coordinates (log where logarithmic), from the curvature at
-            the optimum scaled by the residual and its correlation; shape (k, k).
+        covariance: Of the unknowns' coordinates (log where logarithmic), shape (k, k).
         information: Share of each unknown's certainty that comes from data, 0 (all from the
             model file's belief) to 1.
         motions: Initial motion of each trial, (2m,) each.
@@ -259,20 +259,8 @@ def _evaluate(
         shared_h += BARRIER * jacobian.T @ jacobian
     problem.evaluations += 1
     for i, trial in enumerate(problem.trials):
-        compiled, p, u = problem.compiled[i], problem.vectors[i], problem.inputs[i]
-        p[problem.places[i]] = values
-        n = int(np.searchsorted(trial.time, horizon, side='right'))
-        x0, by_motion, by_free = compiled.initial_sensitivity(motions[i], u[0], p)
+        n, normal, _, _ = _simulate_sensitive(problem, i, values, motions[i], horizon)
         m2 = len(motions[i])
-        s0 = np.zeros((compiled.nx, m2 + k))
-        s0[:, :m2] = by_motion
-        for f, column in enumerate(problem.columns[i]):
-            if column >= 0:
-                s0[:, column] = by_free[:, f]
-        normal, _, _ = compiled.normal(
-            trial.time[:n], u[:n], x0, s0, p, problem.columns[i],
-            trial.outputs[:n], 1 / trial.sigma,
-        )  # fmt: skip
         if normal.rows < n or not np.isfinite(normal.sse).all():
             return None
         h, g = normal.hessian * weight, normal.gradient * weight
@@ -295,6 +283,36 @@ def _evaluate(
             shared_g[j] += away / u.tolerance
             shared_h[j, j] += 1 / u.tolerance**2
     return _Point(cost, shared_h, shared_g, own, sse, count, data_cost)
+
+
+def _simulate_sensitive(
+    problem: _Problem,
+    i: int,
+    values: np.ndarray,
+    motion: np.ndarray,
+    horizon: float,
+    keep: bool = False,
+) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
+    """One trial: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
+
+    Columns: the trial's own initial motion, then the shared values (not coordinates).
+    """
+    trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
+    p = problem.vectors[i]
+    p[problem.places[i]] = values
+    n = int(np.searchsorted(trial.time, horizon, side='right'))
+    x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)
+    m2 = len(motion)
+    s0 = np.zeros((compiled.nx, m2 + len(values)))
+    s0[:, :m2] = by_motion
+    for f, column in enumerate(problem.columns[i]):
+        if column >= 0:
+            s0[:, column] = by_free[:, f]
+    normal, y, jacobian = compiled.normal(
+        trial.time[:n], u[:n], x0, s0, p, problem.columns[i], trial.outputs[:n], 1 / trial.sigma,
+        keep=keep,
+    )  # fmt: skip
+    return n, normal, y, jacobian
 
 
 def _reduce(point: _Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]:
@@ -416,7 +434,7 @@ def fit(
             break
         weight = new
     values = problem.values(theta)
-    covariance, information = _uncertainty(problem, point)
+    covariance, information = _uncertainty(problem, theta, motions, longest, weight)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
     result = Fit(
         model=fitted,
@@ -446,26 +464,71 @@ def _weight(point: _Point) -> float:
     return 1 / (excess * correlation)
 
 
-def _uncertainty(problem: _Problem, point: _Point) -> tuple[np.ndarray, np.ndarray]:
-    h, _, _ = _reduce(point, 0.0)
-    k = len(h)
-    if not k:
-        return np.zeros((0, 0)), np.zeros(0)
+def _uncertainty(
+    problem: _Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the coordinates and the share of each that comes from data: theory.md, (COV).
+
+    Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
+    right for white residuals, and the sandwich of scores summed over blocks longer than their
+    correlation, right where the model leaves slow waves.
+    """
+    point = _evaluate(problem, theta, motions, horizon, weight)
+    k = len(theta)
+    if not k or point is None:
+        return np.zeros((k, k)), np.zeros(k)
     belief = np.array(
         [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in problem.unknowns]
     )
-    scale = np.sqrt(np.maximum(np.diag(h), 1e-300))
-    vectors_values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
-    # A direction that neither data nor belief determine has infinite variance, not a crash.
-    kept = vectors_values > 1e-13 * vectors_values.max()
-    inverse = (vectors[:, kept] / vectors_values[kept]) @ vectors[:, kept].T
-    covariance = inverse / np.outer(scale, scale)
-    lost = (vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6
+    h, _, _ = _reduce(point, 0.0)
+    excess = max(1.0, point.sse.sum() / point.count.sum())
+    rescale = 1 / (excess * weight)
+    h = (h - np.diag(belief)) * rescale + np.diag(belief)
+    inverse, lost = _inverse(h)
+    scores = _block_scores(problem, theta, motions, horizon, point, weight) * rescale
+    sandwich = inverse @ (scores.T @ scores + np.diag(belief)) @ inverse
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
+    covariance = inverse * np.outer(ratio, ratio)
     covariance[lost, lost] = np.inf
     certain = np.where(belief > 0, np.diag(covariance), 0.0)
     information = 1 - np.clip(certain * belief, 0, 1)
     information[lost] = 0.0
     return covariance, information
+
+
+def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of the curvature, and which unknowns it leaves undetermined."""
+    scale = np.sqrt(np.maximum(np.diag(h), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    # A direction that neither data nor belief determine has infinite variance, not a crash.
+    kept = eigenvalues > 1e-13 * eigenvalues.max()
+    inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T
+    lost = (vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6
+    return inverse / np.outer(scale, scale), lost
+
+
+def _block_scores(
+    problem: _Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    point: _Point,
+    weight: float,
+) -> np.ndarray:
+    """Gradient of the cost by the shared unknowns, block by block of time, shape (blocks, k)."""
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    blocks = []
+    for i, trial in enumerate(problem.trials):
+        n, _, y, jacobian = _simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
+        residual = np.nan_to_num((y - trial.outputs[:n]) / trial.sigma**2) * weight
+        rows = np.einsum('kj,kjc->kc', residual, jacobian)
+        edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))
+        sums = np.add.reduceat(rows, edges, axis=0)
+        m2 = len(motions[i])
+        own, cross, _ = point.own[i]
+        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ np.linalg.solve(own, cross))
+    return np.vstack(blocks)
 
 
 def _with_uncertainty(
