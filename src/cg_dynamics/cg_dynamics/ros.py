@@ -8,7 +8,8 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
   `close`, while the context still stands, so that a last zero torque can go out.
 - A node that has something to do between messages has `poll() -> float`: it does what is due
   and returns in how many s it wants to be asked again. One that must not lose what is on its way
-  when it is told to stop has `linger`, the s for which it goes on listening.
+  when it is told to stop has `linger`, the s for which it goes on listening. One whose `poll` may
+  be due without a pause has `eagerness`, the messages that it takes from one to the next.
 """
 
 import dataclasses
@@ -195,9 +196,12 @@ def spin(node: Node, stopped: Callable[[], bool]) -> None:
     executor = EventsExecutor()
     executor.add_node(node)
     poll = getattr(node, 'poll', lambda: IDLE_POLL)
+    eagerness = getattr(node, 'eagerness', 1) - 1
     while not stopped() and not getattr(node, 'finished', False):
         # A wait without a time-out hangs in this executor.
         executor.spin_once(timeout_sec=min(max(poll(), 0.0), IDLE_POLL))
+        for _ in range(eagerness):
+            executor.spin_once(timeout_sec=0.0)
     deadline = time.monotonic() + getattr(node, 'linger', 0.0)
     while time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.01)
