@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -85,6 +86,7 @@ class CompiledModel:
         self.state_names = equations.state_names
         self.parameter_names = equations.parameter_names
         self.input_names = equations.input_names
+        self._never_late = [i for i, name in enumerate(self.input_names) if name == TIME]
         self.channels = equations.channels
         self.nx, self.nu = equations.x.shape[0], equations.u.shape[0]
         self.np, self.ny = equations.p.shape[0], equations.outputs.shape[0]
@@ -403,13 +405,13 @@ def _source(e: Equations, free: tuple[str, ...]) -> str:
     return '\n'.join([generator.dump(), defines, runtime])
 
 
-def _compile(source: str, target: Path, gcc: str) -> None:
+def _compile(source: str, target: Path, gcc: str, flags: tuple[str, ...] = FLAGS) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent) as directory:
         c, so = Path(directory) / 'model.c', Path(directory) / 'model.so'
         c.write_text(source)
         result = subprocess.run(
-            [gcc, *FLAGS, '-o', str(so), str(c), '-lm'], capture_output=True, text=True
+            [gcc, *flags, '-o', str(so), str(c), '-lm'], capture_output=True, text=True
         )
         if result.returncode:
             raise RuntimeError(f'{gcc} failed on a generated model:\n{result.stderr[:2000]}')
