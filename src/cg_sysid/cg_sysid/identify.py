@@ -13,7 +13,7 @@ parameters far outside what the model file believes.
 """
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -387,6 +387,7 @@ def fit(
     reweight: bool = True,
     horizon: float = np.inf,
     start: Fit | None = None,
+    at: Mapping[str, float] | None = None,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -398,6 +399,7 @@ def fit(
         reweight: Let the weights follow the residual that is left.
         horizon: Use only this much of each record, in s: a cheap first look.
         start: Set out from this fit of the same unknowns to a shorter horizon instead.
+        at: Set out from these values (full name -> value) instead of those of the file.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -407,7 +409,7 @@ def fit(
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only)
     problem = _Problem(model, trials, unknowns)
-    values = [u.prior for u in unknowns] if start is None else start.values
+    values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motions = [trial.motion for trial in trials] if start is None else list(start.motions)
     longest = min(max(trial.duration for trial in trials), horizon)
