@@ -136,6 +136,8 @@ def simulate_batch(
         return _one_by_one(compiled, time, u, x0, p, trajectories, feedback)
     shape = (batch, n, compiled.nx) if trajectories else (batch, compiled.nx)
     states = np.empty(shape)
+    # C sees addresses only: every array must be held by a name until it returns.
+    rows = np.diff(time)
     pointers = [None] * 3
     if feedback is not None:
         pointers = [
@@ -145,7 +147,7 @@ def simulate_batch(
 
     def run(first: int, last: int) -> None:
         library.cgb_simulate(
-            first, last, n, _pointer(np.diff(time)), compiled.largest_step, _pointer(u), u_each,
+            first, last, n, _pointer(rows), compiled.largest_step, _pointer(u), u_each,
             _pointer(x0), _pointer(p), p_each, *map(_pointer, pointers), trajectories,
             _pointer(states),
         )  # fmt: skip
