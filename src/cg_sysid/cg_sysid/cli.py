@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cg_dynamics.model import Model
 from cg_sysid.bags import parse_note
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
@@ -116,22 +115,6 @@ def common_options(parser: argparse.ArgumentParser) -> None:
 def load_note(path: str | None) -> dict[str, Any] | None:
     """The recording note of a file; None if no file is named."""
     return parse_note(Path(path).read_text('utf-8'), path) if path else None
-
-
-def load_model(path: str) -> Model:
-    """The model of a file, with an error that fits on one line."""
-    return Model.load(path)
-
-
-def prepare_directory(path: Path) -> None:
-    """Create the directory of the results.
-
-    Raises:
-        ValueError: It is a file.
-    """
-    if path.exists() and not path.is_dir():
-        raise ValueError(f'--out {path}: a file is in the way; name a directory')
-    path.mkdir(parents=True, exist_ok=True)
 
 
 def print_gain(console: Console, facts: Facts) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
 from cg_sysid.diagnose import Diagnosis, Options, diagnose
@@ -75,7 +76,10 @@ def work(options: argparse.Namespace) -> int:
         raise ValueError(f'--rounds is {options.rounds}; at least 1 is needed')
     if options.workers is not None and options.workers < 0:
         raise ValueError(f'--workers is {options.workers}; it must not be negative')
-    model = cli.load_model(options.model)
+    if options.out.is_file():
+        raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
+    model = Model.load(options.model)
+    effects = _effects(options.effects, model)
     note = cli.load_note(options.note)
     with cli.Bars(options.quiet) as bars:
         intake = take_in(
@@ -97,11 +101,11 @@ def work(options: argparse.Namespace) -> int:
             answer = None
         else:
             answer = diagnose(
-                model, intake.records, _options(options, intake), bars
+                model, intake.records, _options(options, effects, intake), bars
             )
             facts = diagnosis_facts(answer, intake, origin)
             lines = diagnosis_curves(answer)
-        cli.prepare_directory(options.out)
+        options.out.mkdir(parents=True, exist_ok=True)
         bars('writing the report', 0, 1)
         write_results(options.out, facts, lines, answer)
         bars('writing the report', 1, 1)
@@ -146,8 +150,25 @@ def _why(intake: Intake) -> str:
     return f'{which} broken, and nothing was fitted. {first.name}: {first.reason}.'
 
 
-def _options(options: argparse.Namespace, intake: Intake) -> Options:
-    effects = tuple(e.strip() for e in options.effects.split(',')) if options.effects else None
+def _effects(text: str | None, model: Model) -> tuple[str, ...] | None:
+    """The effects that were asked for; None for the whole library."""
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    body = model.mechanism
+    known = {effect(body, at).label for effect in LIBRARY.values() for at in effect.sites(body)}
+    known |= set(LIBRARY)
+    for name in names or ('',):
+        if name not in known:
+            raise ValueError(
+                f'--effects: no effect {name!r}; the library has: {", ".join(sorted(LIBRARY))}'
+            )
+    return names
+
+
+def _options(
+    options: argparse.Namespace, effects: tuple[str, ...] | None, intake: Intake
+) -> Options:
     held = None
     if options.held:
         names = [record.name for record in intake.records]

@@ -56,7 +56,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def work(options: argparse.Namespace) -> int:
     """Read, check, identify, write."""
-    model = cli.load_model(options.model)
+    if options.out.is_file():
+        raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
+    model = Model.load(options.model)
     note = cli.load_note(options.note)
     only = tuple(n.strip() for n in options.only.split(',')) if options.only else None
     with cli.Bars(options.quiet) as bars:
@@ -84,7 +86,7 @@ def work(options: argparse.Namespace) -> int:
         facts = identification_facts(
             model, found, before, trials, intake, options.method, origin
         )
-        cli.prepare_directory(options.out)
+        options.out.mkdir(parents=True, exist_ok=True)
         write_facts(facts, options.out)
         curves.save(_curves(model, before, found, trials), options.out)
         identified_model(model, found, facts, intake).save(options.out / 'model.yaml')

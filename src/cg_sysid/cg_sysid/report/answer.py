@@ -105,7 +105,7 @@ def _notes(facts: Facts) -> Markup | None:
         return None
     notes = facts['findings']
     items = tag('ul', [tag('li', note) for note in notes], class_='notes small')
-    if len(notes) > 4:
+    if len(notes) > 4 and facts['causes']:
         items = tag('details', tag('summary', f'{len(notes)} remarks on the fit'), items)
         return tag('div', items, class_='card')
     return tag('div', tag('h3', 'Worth knowing'), items, class_='card')

@@ -86,7 +86,8 @@ def _source(source: Facts) -> Markup:
             tag('span', words.get(source['check'], source['check']),
                 class_=f'pill {source["check"]}')),
         _findings(serious),
-        _findings(info),
+        tag('details', tag('summary', f'{len(info)} observations', class_='soft small'),
+            _findings(info)) if info else None,
         None if source['findings'] else tag('p', 'Nothing to remark.', class_='soft'),
         open=not source['used'],
     )  # fmt: skip

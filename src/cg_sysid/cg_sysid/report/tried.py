@@ -103,7 +103,7 @@ def parameters(facts: Facts) -> Markup | None:
     """Nominal and identified values, and how they go together."""
     moved = [p for p in facts['parameters'] if not p['fixed']]
     fixed = [p for p in facts['parameters'] if p['fixed']]
-    if not moved and not fixed:
+    if facts['verdict'] == 'unusable' or not (moved or fixed):
         return None
     head = tag('tr', tag('th', 'parameter'), tag('th', 'model file', class_='num'),
                tag('th', 'identified', class_='num'), tag('th', 'unit'),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
+from cg_sysid.text import effect_name, listed, measured, number, scaled
 
 Facts = dict[str, Any]
 
@@ -48,7 +48,9 @@ def headline(facts: Facts) -> str:
 def lead(facts: Facts) -> str:
     """One sentence below the headline."""
     verdict = facts['verdict']
-    if verdict in ('unusable', 'identified') or not facts['gain']:
+    if verdict == 'unusable':
+        return 'Nothing was fitted. The places below need repair, or a new recording.'
+    if verdict == 'identified' or not facts['gain']:
         return facts['summary']
     channel = best_channel(facts)
     gain = facts['gain'][channel]
@@ -70,8 +72,8 @@ def lead(facts: Facts) -> str:
     if verdict == 'consistent':
         return f'On held-out recordings the error of {channel} is {left}.'
     return (
-        f'{sentence(channel)} is simulated with an error of {left} on held-out recordings, and '
-        'nothing in the library of effects removes it.'
+        f'The simulation misses {channel} by {left} on held-out recordings, and nothing in the '
+        'library of effects removes that.'
     )
 
 
@@ -93,9 +95,9 @@ def _ratio(gain: Facts, key: str) -> float:
 
 def setup_words(setup: Facts) -> str:
     """A set-up in a few words."""
-    words = []
+    words: list[str] = []
     if setup.get('fixture', 'none') != 'none':
-        words.append(FIXTURES.get(setup['fixture'], setup['fixture']))
+        words.append(FIXTURES.get(setup['fixture'], str(setup['fixture'])))
     else:
         words.append(f'stance {setup.get("stance", "inner")}')
     springs = len(setup.get('springs') or ())
