@@ -1,0 +1,97 @@
+"""Write docs/effects.md from the effect library: python tools/make_effects_doc.py."""
+
+import math
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TARGET = ROOT / 'docs' / 'effects.md'
+
+PLACES = {
+    'command': 'between the torque that the drive reports and the motor',
+    'transmission': 'between motor and joint',
+    'joint': 'at the joint',
+    'body': 'on a body',
+    'environment': 'around the robot',
+    'impact': 'when a foot lands',
+    'sensor': 'in a sensor',
+    'timing': 'in time',
+}
+
+
+def number(value: float) -> str:
+    """A number as it stands in a model file."""
+    if math.isinf(value):
+        return 'infinite'
+    return f'{value:g}'
+
+
+def section(effect, mechanisms) -> list[str]:
+    """The part of the page about one effect."""
+    sites = {name: effect.sites(mechanism) for name, mechanism in mechanisms.items()}
+    where = '; '.join(
+        f'{name}: {", ".join(f"`{site}`" for site in found)}'
+        for name, found in sites.items()
+        if found and found != ('all',)
+    )
+    plain = [name for name, found in sites.items() if found == ('all',)]
+    if plain:
+        where = '; '.join(filter(None, [where, f'as a whole: {", ".join(plain)}']))
+    lines = [
+        f'### `{effect.name}`',
+        effect.summary,
+        '',
+        f'Acts {PLACES[effect.place]}. Sites, the usual one first: {where}.',
+    ]
+    if effect.states:
+        lines.append(f'Extra states: {", ".join(f"`{state}`" for state in effect.states)}.')
+    if effect.extra_inputs:
+        names = ', '.join(f'`{name}`' for name in effect.extra_inputs)
+        lines.append(f'Needs in the recording: {names}.')
+    if math.isfinite(effect.largest_step):
+        lines.append(f'Longest step of integration: {1e3 * effect.largest_step:g} ms.')
+    lines += [
+        '',
+        '| parameter | unit | meaning | range | vanishes at | identification starts at | free |',
+        '|---|---|---|---|---|---|---|',
+    ]
+    for p in effect.parameters:
+        starts = ', '.join(map(number, p.starts)) or '-'
+        neutral = '-' if p.neutral is None else number(p.neutral)
+        lines.append(
+            f'| `{p.name}` | {p.unit} | {p.description} | {number(p.lower)} to {number(p.upper)} '
+            f'| {neutral} | {starts} | {"yes" if p.free else "no"} |'
+        )
+    return [*lines, '']
+
+
+def page() -> str:
+    """The whole page."""
+    from cg_dynamics.effects import LIBRARY
+    from cg_dynamics.mechanisms import MECHANISMS
+
+    lines = [
+        '# Effects',
+        '',
+        'Every effect of the library. This page is written by `tools/make_effects_doc.py`; do not '
+        'edit it.',
+        '',
+        'A model file lists the effects that a robot has, in the order in which they act; '
+        'diagnosis tries all of them. At the value in the column "vanishes at" the effect is not '
+        'there at all. "Free: no" marks parameters of shape that identification leaves alone '
+        'unless told. A new effect is one class in one file of '
+        '`src/cg_dynamics/cg_dynamics/effects`.',
+        '',
+    ]
+    for place, words in PLACES.items():
+        found = [effect for effect in LIBRARY.values() if effect.place == place]
+        if found:
+            lines += [f'## {place.capitalize()}: {words}', '']
+            for effect in found:
+                lines += section(effect, MECHANISMS)
+    return '\n'.join(lines).rstrip() + '\n'
+
+
+if __name__ == '__main__':
+    sys.path[:0] = [str(ROOT / 'src' / name) for name in ('cg_dynamics', 'cg_description')]
+    TARGET.write_text(page(), encoding='utf-8')
