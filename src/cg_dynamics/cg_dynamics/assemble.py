@@ -4,17 +4,17 @@ x = (s, ds/dt, z): free coordinates, their rates, extra states of the effects. T
 vector p is the mechanism's parameters, then those of each effect, then those of the springs.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects import Body, Effect
+from cg_dynamics.effects.effect import SPRING_FIELDS, TIME
 from cg_dynamics.lagrange import manipulator, solve_small
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-
-SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
 
 
 @dataclass(frozen=True)
@@ -98,10 +98,11 @@ def assemble(model: Model, setup: Setup) -> Equations:
         effect.label: {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
         for effect in effects
     }
-    extra_inputs = tuple(dict.fromkeys(name for e in effects for name in e.extra_inputs))
+    asked = dict.fromkeys(name for e in effects for name in e.extra_inputs)
+    extra_inputs = tuple(name for name in asked if name not in mechanism.inputs)
     u = ca.SX.sym('u', len(mechanism.inputs) + len(extra_inputs))
     torque_inputs = ca.vertsplit(u)[: len(mechanism.inputs)]
-    measured = dict(zip(extra_inputs, ca.vertsplit(u)[len(mechanism.inputs) :], strict=True))
+    measured = dict(zip((*mechanism.inputs, *extra_inputs), ca.vertsplit(u), strict=True))
     for e in effects:
         own[e.label] |= {name: measured[name] for name in e.extra_inputs}
     kinematics = mechanism.kinematics(setup)
@@ -150,14 +151,11 @@ def assemble(model: Model, setup: Setup) -> Equations:
     up = ca.SX([0, 1])
     for e in effects:
         up = e.up(up, own[e.label])
-    body = Body(mechanism, setup, q, v, by_name, up)
-    kinetic, potential = mechanism.energies(q, v, by_name, setup, up)
-    for i, spring in enumerate(setup.springs):
-        numbers = {field: by_name[f'spring{i}.{field}'] for field in SPRING_FIELDS}
-        end, _ = body.point(spring.body, numbers['point'])
-        reach = end - ca.vertcat(numbers['anchor_x'], numbers['anchor_z'])
-        stretch = ca.sqrt(ca.sumsqr(reach)) - numbers['free_length']
-        potential += numbers['stiffness'] * stretch**2 / 2
+    body = Body(mechanism, setup, q, v, by_name, up, foot=ca.SX.zeros(2))
+    body = replace(body, foot=sum((e.foot(body, own[e.label]) for e in effects), body.foot))
+    kinetic, potential = mechanism.energies(q, v, by_name, setup, up, body.foot)
+    for stretch, stiffness in body.springs():
+        potential += stiffness * stretch**2 / 2
     force = ca.SX.zeros(q.shape)
     for e in effects:
         more_kinetic, more_potential = e.energies(body, own[e.label])
@@ -175,7 +173,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
     for e in effects:
         if overrides(e, 'read'):
             if e.states:
-                starts[e.label] = e.initial_states(outputs[e.site], ca.SX(0), ca.SX(0), own[e.label])
+                starts[e.label] = e.initial_readings(outputs, own[e.label])
             outputs = pass_through(e, e.read(outputs, z_of[e.label], own[e.label]))
 
     input_delay = ca.SX(0)
@@ -215,3 +213,12 @@ def assemble(model: Model, setup: Setup) -> Equations:
 def overrides(effect: Effect, hook: str) -> bool:
     """True if an effect does something at that place."""
     return getattr(type(effect), hook) is not getattr(Effect, hook)
+
+
+def stamped(u: np.ndarray, input_names: Sequence[str], time: float) -> np.ndarray:
+    """The inputs u, shape (nu,), with the input `time` set where a model has one."""
+    if TIME not in input_names:
+        return u
+    u = np.array(u, float)
+    u[input_names.index(TIME)] = time
+    return u

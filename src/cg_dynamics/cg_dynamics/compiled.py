@@ -159,6 +159,7 @@ class CompiledModel:
         mean, slope = u.copy(), np.zeros_like(u)
         mean[:-1] = np.diff(integral, axis=0) / dt[:, None]
         slope[:-1] = -np.diff(held, axis=0) / dt[:, None]
+        mean[:, self._never_late], slope[:, self._never_late] = u[:, self._never_late], 0.0
         return mean, slope
 
     def simulate(

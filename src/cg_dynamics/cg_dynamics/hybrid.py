@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import brentq
 
-from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.impact import Impact, impact, other
@@ -183,7 +183,7 @@ def walk(
         duration: In s.
         command: (time, stance, x) -> torque (1,), asked every `sample_time` and held; it acts
             late by the model's input delay. None: no torque. Extra inputs of effects are
-            switches that are on.
+            switches that are on, and the time.
         options: How to walk.
 
     Raises:
@@ -225,6 +225,7 @@ class _Walker:
                 while latches and latches[0][0] <= t + INSTANT:
                     u = latches.pop(0)[1]
                 until = min(end, latches[0][0]) if latches else end
+                u = stamped(u, leg.compiled.input_names, t)
                 steps = max(1, math.ceil((until - t) / self.step - 1e-9))
                 t, x, event = self._one_step(leg, t, x, u, (until - t) / steps)
                 if event is None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
@@ -75,7 +75,8 @@ class Plant:
                 )
         self._input_delay, self._output_delays, _ = self._compiled.delays(self._p)
         self._torques = len(model.mechanism.inputs)
-        self._applied = self._inputs(np.zeros(self._torques))
+        names = self._compiled.input_names
+        self._applied = stamped(self._inputs(np.zeros(self._torques)), names, 0.0)
         self._latches: list[tuple[float, np.ndarray]] = [(-np.inf, self._applied)]
         self._x = self._compiled.initial_state(motion, self._applied, self._p)
         self._tick = 0
@@ -105,7 +106,7 @@ class Plant:
         self._latches.append((self.time, self._applied))
 
     def _inputs(self, torque: np.ndarray) -> np.ndarray:
-        # Extra inputs of the simulated machine are switches that are on.
+        # Extra inputs of the simulated machine are switches that are on; `stamped` sets the time.
         return np.concatenate([torque, np.ones(self._compiled.nu - self._torques)])
 
     def advance(self) -> None:
@@ -120,9 +121,9 @@ class Plant:
         first = bisect.bisect_right(times, start + 1e-12) - 1
         edges = [start, *(t for t in times[first + 1 :] if t < end - 1e-12), end]
         for index, (begin, stop) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-            torque = self._latches[first + index][1]
+            u = stamped(self._latches[first + index][1], self._compiled.input_names, start)
             steps = max(1, int(np.ceil((stop - begin) / self._fine - 1e-9)))
-            self._compiled.advance(self._x, torque, self._p, (stop - begin) / steps, steps)
+            self._compiled.advance(self._x, u, self._p, (stop - begin) / steps, steps)
         self._latches = self._latches[first:]
         self._tick += 1
         if not np.isfinite(self._x).all() or np.abs(self._x).max() > 1e4:
@@ -156,12 +157,13 @@ class Plant:
         )
 
     def _clean_outputs(self) -> np.ndarray:
-        u = self._latches[-1][1]
+        held, names = self._latches[-1][1], self._compiled.input_names
+        u = stamped(held, names, self.time)
         now = np.asarray(self._compiled.h(self._x, u, self._p)).ravel()
         for j in np.flatnonzero(self._output_delays):
-            now[j] = np.asarray(
-                self._compiled.h(self._at(self.time - self._output_delays[j]), u, self._p)
-            )[j, 0]
+            late = self.time - self._output_delays[j]
+            u = stamped(held, names, late)
+            now[j] = np.asarray(self._compiled.h(self._at(late), u, self._p))[j, 0]
         return now
 
     def _at(self, t: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import acting_effects, parameter_names, parameter_vector
+from cg_dynamics.assemble import acting_effects, overrides, parameter_names, parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import Body
 from cg_dynamics.errors import ModelError
@@ -29,17 +29,15 @@ class FloatingBody(Body):
     """The mechanism as an effect sees it while the stance foot is anywhere.
 
     Attributes:
-        foot: Position of the stance foot in m, shape (2, 1).
-        foot_rate: Its velocity in m/s.
+        foot_rate: Velocity of the stance foot in m/s, shape (2, 1).
     """
 
-    foot: ca.SX
     foot_rate: ca.SX
 
     def point(self, name: str, distance) -> tuple[ca.SX, ca.SX]:
         """World position in m and velocity in m/s of a point of a body."""
         position, velocity = super().point(name, distance)
-        return self.foot + position, self.foot_rate + velocity
+        return position, self.foot_rate + velocity
 
 
 @dataclass(frozen=True)
@@ -86,6 +84,9 @@ def unpinned(model: Model, stance: str) -> Unpinned:
     hip_rate = v[2:] + l * normal(q[leg]) * v[leg]
 
     effects = acting_effects(model)
+    for effect in effects:
+        if overrides(effect, 'foot'):
+            raise ModelError(f'impacts and ground forces know point feet only, not {effect.label}')
     own = {
         e.label: {a.name: by_name[f'{e.label}.{a.name}'] for a in e.parameters} for e in effects
     }

@@ -9,6 +9,7 @@ from cg_dynamics.compiled import compile_model, simulate
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.rig import Setup
+from conftest import SPRINGS
 
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]
@@ -18,9 +19,10 @@ START = np.array([0.05, 0.1, 0.2, -0.3])
 
 
 def torque_of(model, torque=TORQUE):
-    """Inputs of a model: torque, and its extra ones switched on."""
-    extra = compile_model(model, Setup()).nu - 1
-    return np.hstack([torque, np.ones((len(torque), extra))])
+    """Inputs of a model: torque, and its extra ones: the time, or a switch that is on."""
+    extra = compile_model(model, Setup()).input_names[1:]
+    columns = [TIME if name == 'time' else np.ones(len(TIME)) for name in extra]
+    return np.column_stack([torque, *columns])
 
 
 def right_side(model, setup=None):
@@ -72,9 +74,9 @@ def test_formula_of_the_effect_vanishes_at_the_neutral_value(bare, name, site, m
 
 @pytest.mark.parametrize(('name', 'site'), EVERYWHERE)
 def test_effect_at_its_default_changes_something(bare, name, site):
-    model = bare.with_effect(name, at=site)
-    changed = simulate(model, Setup(), TIME, torque_of(model), START)[1]
-    plain = simulate(bare, Setup(), TIME, TORQUE, START)[1]
+    model, setup = bare.with_effect(name, at=site), Setup(springs=SPRINGS)
+    changed = simulate(model, setup, TIME, torque_of(model), START)[1]
+    plain = simulate(bare, setup, TIME, TORQUE, START)[1]
     assert np.abs(changed - plain).max() > 1e-7
 
 

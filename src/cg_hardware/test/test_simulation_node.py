@@ -22,6 +22,7 @@ from std_msgs.msg import String  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
+from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 from cg_hardware.simulation import SimulationSettings  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
 
@@ -116,6 +117,17 @@ def test_lockstep_peer_that_falls_silent_ends_the_run_with_zero_torque(bench):
     bench.until(lambda: machine.exit_status == 1 and bench.applied[-1].effort[0] == 0.0)
     assert machine.phase == 'off'
     assert [m.effort[0] for m in bench.applied] == [5.0] * 10 + [0.0]
+
+
+def test_lockstep_works_through_the_safety_gate(bench):
+    bench.add(SafetyGateNode(parameter_overrides=[Parameter('torque_limit', value=2.0)]))
+    bench.controller.destroy_publisher(bench.command)
+    bench.command = bench.controller.create_publisher(JointState, '/torque_request', SENSOR_QOS)
+    bench.answer = lambda message: 1.0 if len(bench.applied) < 10 else 3.0
+    machine = bench.machine(mode='lockstep', duration=0.04)
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 20)
+    assert machine.exit_status == 0
+    assert [m.effort[0] for m in bench.applied] == [1.0] * 10 + [2.0] * 10
 
 
 @pytest.mark.parametrize(('torque', 'applied'), [(math.nan, 0.0), (100.0, 40.0), (-55.0, -40.0)])

@@ -18,6 +18,7 @@ import numpy as np
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
 
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.identify import Fit, IdentificationError, fit, predict, score
@@ -216,11 +217,15 @@ def split(
     return train, held
 
 
-def candidates_for(model: Model, names: Sequence[str] | None = None) -> list[tuple[str, str | None]]:
-    """(effect, at) of everything in the library that the model does not have yet."""
+def candidates_for(
+    model: Model, setups: Sequence[Setup], names: Sequence[str] | None = None
+) -> list[tuple[str, str | None]]:
+    """(effect, at) of all that could show in these set-ups and that the model does not have."""
     present = {effect.label for effect in model.effects}
     found = []
     for name, effect in LIBRARY.items():
+        if not effect.applies(setups):
+            continue
         for at in effect.sites(model.mechanism):
             made = effect(model.mechanism, at)
             wanted = names is None or name in names or made.label in names
@@ -274,7 +279,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     try:
         best = _best_fit(task, train)
         held_score = score(best.model, held)
-        model = _believing(best.model, task.model)
+        model = believing(best.model, task.model)
         residuals = tuple(
             (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
             for trial, motion in zip(
@@ -321,9 +326,11 @@ def _starting_models(task: Task):
         yield task.model.with_effect(name, at, **start)
 
 
-def _believing(fitted: Model, base: Model) -> Model:
-    # The next fit believes what the nominal file believes, and of the effects added so far that
-    # they are about what was found.
+def believing(fitted: Model, base: Model) -> Model:
+    """The fitted structure with the base's numbers and beliefs; added effects keep their values.
+
+    What a fit found is a start for the next one, not a belief.
+    """
     added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
              if n not in base.quantities}
     return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
@@ -399,7 +406,9 @@ class _Search:
         )
 
     def _round(self, base: Outcome) -> tuple[list[tuple[Candidate, Outcome]], float]:
-        tasks = [Task(base.model, c) for c in candidates_for(base.model, self.options.effects)]
+        setups = [trial.setup for trial in (*self.train, *self.held)]
+        effects = candidates_for(base.model, setups, self.options.effects)
+        tasks = [Task(base.model, effect) for effect in effects]
         outcomes = self._fit(tasks, f'effects on top of {base.label}')
         for task, outcome in zip(tasks, outcomes, strict=True):
             if isinstance(outcome, str):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.mechanisms import Mechanism
-from cg_dynamics.mechanisms import mechanism as mechanism_named
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -51,17 +51,15 @@ class Trial:
     def inputs_for(self, names: Sequence[str]) -> np.ndarray:
         """Inputs in the order that a model wants, shape (n, len(names)).
 
-        A switch that was not recorded (`drive_enabled`) counts as on.
+        `time` is the time of the rows; a switch that was not recorded (`drive_enabled`) counts
+        as on.
         """
         if tuple(names) == self.input_names:
             return self.inputs
+        recorded = dict(zip(self.input_names, self.inputs.T, strict=True))
+        known = {TIME: self.time, **recorded}
         ones = np.ones(len(self.time))
-        return np.column_stack(
-            [
-                self.inputs[:, self.input_names.index(n)] if n in self.input_names else ones
-                for n in names
-            ]
-        )
+        return np.column_stack([known.get(name, ones) for name in names])
 
     @property
     def duration(self) -> float:

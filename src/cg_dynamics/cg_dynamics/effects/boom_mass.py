@@ -2,11 +2,11 @@
 
 import casadi as ca
 
-from cg_dynamics.effects.effect import Effect
+from cg_dynamics.effects.effect import StanceEffect
 from cg_dynamics.parameter import Parameter
 
 
-class BoomMass(Effect):
+class BoomMass(StanceEffect):
     """V = m g (up . hip) with no kinetic energy of its own; m is negative for a counterweight."""
 
     name = 'boom_mass'
@@ -22,12 +22,7 @@ class BoomMass(Effect):
         ),
     )  # fmt: skip
 
-    @classmethod
-    def sites(cls, mechanism):
-        """Only the compass gait has a hip that walks."""
-        return ('all',) if mechanism.name == 'compass_gait' else ()
-
     def energies(self, body, p):
         """Potential energy at the hip, the upper end of the stance leg."""
-        hip, _ = body.point(body.setup.stance, body.p['leg_length'])
+        hip, _ = body.hip()
         return 0, p['weight'] * body.p['gravity'] * ca.dot(body.up, hip)

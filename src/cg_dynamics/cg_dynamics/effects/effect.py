@@ -5,13 +5,16 @@ receives what flows through that place and returns what leaves it. The order alo
 path is the order of the hooks below, so any effects compose:
 
     input --input_delay--> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
-    Q and M also take energies, force and up;   outputs: read, then output_delay
+    Q and M also take energies, force, foot and up;   outputs: read, then output_delay
 
 In every hook `p` maps the effect's own parameter names to symbols and `z` holds its own extra
-states, a list; a hook that owns states returns their rates in the same order.
+states, a list; a hook that owns states returns their rates in the same order. Inputs that an
+effect asks for by name in `extra_inputs` come in `p` too: the reported torques, the time since
+the start of the record (`time`, in s), and recorded switches, which count as on where no one
+recorded them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,6 +26,8 @@ from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 
 Symbols = Mapping[str, ca.SX]
+SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
+TIME = 'time'  # the extra input that is the time since the start of the record, in s
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class Body:
         v: Their rates.
         p: The mechanism's parameters by name.
         up: Unit vector (x, z) against gravity.
+        foot: Where effects move the foot that stands, (x, z) in m; an ideal one is at (0, 0).
     """
 
     mechanism: Mechanism
@@ -44,11 +50,32 @@ class Body:
     v: ca.SX
     p: Symbols
     up: ca.SX
+    foot: ca.SX
 
     def point(self, name: str, distance) -> tuple[ca.SX, ca.SX]:
         """World position in m and velocity in m/s of a point of a body, shapes (2, 1)."""
-        position = self.mechanism.point(name, distance, self.q, self.p, self.setup)
+        ideal = self.mechanism.point(name, distance, self.q, self.p, self.setup)
+        position = self.foot + ideal
         return position, ca.jtimes(position, self.q, self.v)
+
+    @property
+    def stance(self) -> int:
+        """Which coordinate is the lean of the leg that stands."""
+        return self.mechanism.bodies.index(self.setup.stance)
+
+    def hip(self) -> tuple[ca.SX, ca.SX]:
+        """Position in m and velocity in m/s of the hip of a compass gait."""
+        return self.point(self.setup.stance, self.p['leg_length'])
+
+    def springs(self) -> list[tuple[ca.SX, ca.SX]]:
+        """Stretch in m beyond the free length and stiffness in N/m of the set-up's springs."""
+        found = []
+        for i, spring in enumerate(self.setup.springs):
+            p = {field: self.p[f'spring{i}.{field}'] for field in SPRING_FIELDS}
+            end, _ = self.point(spring.body, p['point'])
+            length = ca.sqrt(ca.sumsqr(end - ca.vertcat(p['anchor_x'], p['anchor_z'])))
+            found.append((length - p['free_length'], p['stiffness']))
+        return found
 
 
 class Effect:
@@ -62,8 +89,7 @@ class Effect:
         parameters: Declared parameters.
         states: Names of extra states.
         largest_step: Longest integration step in s at which the effect is still simulated well.
-        extra_inputs: Measured inputs besides the torques that the effect needs; they come with
-            its parameters in `p`.
+        extra_inputs: Inputs by name that the effect needs; they come with its parameters in `p`.
         at: Joint, body or sensor where this instance acts; None where there is only one.
     """
 
@@ -99,6 +125,11 @@ class Effect:
             return tuple(mechanism.joints)
         return ('all',)
 
+    @classmethod
+    def applies(cls, setups: Sequence[Setup]) -> bool:
+        """False if no experiment in any of these set-ups could show the effect."""
+        return True
+
     def acts(self, values: Mapping[str, float]) -> bool:
         """False if the first parameter has its neutral value, so that nothing happens at all."""
         first = self.parameters[0]
@@ -130,6 +161,10 @@ class Effect:
         """Direction against gravity, (x, z)."""
         return up
 
+    def foot(self, body: Body, p: Symbols) -> ca.SX:
+        """Where the foot that stands is moved, (x, z) in m: shape (2, 1), of coordinates only."""
+        return ca.SX.zeros(2)
+
     def energies(self, body: Body, p: Symbols) -> tuple[ca.SX, ca.SX]:
         """Kinetic and potential energy in J that the effect adds."""
         return ca.SX(0), ca.SX(0)
@@ -152,6 +187,10 @@ class Effect:
         """Extra states at the start of a record, from joint angle, rate and held torque."""
         return [ca.SX(0) for _ in self.states]
 
+    def initial_readings(self, outputs: dict[str, ca.SX], p: Symbols) -> list[ca.SX]:
+        """The same for the states of a `read` hook, from what the sensors should report."""
+        return [ca.SX(0) for _ in self.states]
+
 
 class SensorEffect(Effect):
     """An effect of one sensor channel."""
@@ -165,6 +204,26 @@ class SensorEffect(Effect):
         return tuple(c for c, kind in mechanism.sensor_kinds.items() if kind == cls.kind)
 
 
+class ImuEffect(Effect):
+    """An effect of both channels of an IMU.
+
+    Attributes:
+        channels: Its channels of lean angle and rate.
+    """
+
+    place = 'sensor'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """Only where there is one."""
+        return ('all',) if {'inclinometer', 'gyro'} <= set(mechanism.sensor_kinds.values()) else ()
+
+    def __init__(self, mechanism: Mechanism, at: str | None = None):
+        super().__init__(mechanism, at)
+        channel_of = {kind: channel for channel, kind in mechanism.sensor_kinds.items()}
+        self.channels = (channel_of['inclinometer'], channel_of['gyro'])
+
+
 class BodyEffect(Effect):
     """An effect tied to one body."""
 
@@ -174,3 +233,35 @@ class BodyEffect(Effect):
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
         """The bodies of the mechanism."""
         return mechanism.bodies
+
+
+class StanceEffect(Effect):
+    """An effect of the foot that stands, or of a hip that moves over it."""
+
+    place = 'environment'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """Only the compass gait stands on a foot."""
+        return ('all',) if mechanism.name == 'compass_gait' else ()
+
+    @classmethod
+    def applies(cls, setups: Sequence[Setup]) -> bool:
+        """Only where the leg that stands is free to lean."""
+        return any(setup.fixture not in ('inner_fixed', 'outer_fixed') for setup in setups)
+
+
+class SpringEffect(Effect):
+    """An effect of the springs of the set-up."""
+
+    place = 'environment'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """Springs are tied to the legs of a compass gait."""
+        return ('all',) if mechanism.name == 'compass_gait' else ()
+
+    @classmethod
+    def applies(cls, setups: Sequence[Setup]) -> bool:
+        """Only where there is a spring."""
+        return any(setup.springs for setup in setups)

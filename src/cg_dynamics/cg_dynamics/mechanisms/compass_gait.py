@@ -52,13 +52,14 @@ class CompassGait(Mechanism):
         Parameter('c6', '1', 'first moment of the hip body, a quarter', -0.5, 0.5, scale=5e-4),
     )
 
-    def energies(self, q, v, p: Symbols, setup: Setup, up):
+    def energies(self, q, v, p: Symbols, setup: Setup, up, foot=None):
         """(CG2), (CG3)."""
         stance = 0 if setup.stance == 'inner' else 1
         l = p['leg_length']
-        return self.energies_about_hip(
-            q, v, l * direction(q[stance]), l * normal(q[stance]) * v[stance], p, up
-        )
+        hip, hip_rate = l * direction(q[stance]), l * normal(q[stance]) * v[stance]
+        if foot is not None:
+            hip, hip_rate = foot + hip, ca.jtimes(foot, q, v) + hip_rate
+        return self.energies_about_hip(q, v, hip, hip_rate, p, up)
 
     def energies_about_hip(self, q, v, hip, hip_rate, p: Symbols, up):
         """(CG2), (CG3) for a hip anywhere, in m, moving at hip_rate, in m/s, shapes (2, 1)."""

@@ -34,7 +34,7 @@ class DoublePendulum(Mechanism):
         Parameter('gravity', 'm/s^2', 'acceleration of gravity', 0.0, 30.0, free=False),
     )
 
-    def energies(self, q, v, p: Symbols, setup, up):
+    def energies(self, q, v, p: Symbols, setup, up, foot=None):
         """(DP1), (DP2)."""
         w1, w2 = v[0], v[0] + v[1]
         kinetic = (

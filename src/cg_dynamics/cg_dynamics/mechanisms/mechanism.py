@@ -53,7 +53,13 @@ class Mechanism(ABC):
 
     @abstractmethod
     def energies(
-        self, q: ca.SX, v: ca.SX, p: Symbols, setup: Setup, up: ca.SX
+        self,
+        q: ca.SX,
+        v: ca.SX,
+        p: Symbols,
+        setup: Setup,
+        up: ca.SX,
+        foot: ca.SX | None = None,
     ) -> tuple[ca.SX, ca.SX]:
         """Kinetic and potential energy in J.
 
@@ -63,6 +69,7 @@ class Mechanism(ABC):
             p: Parameters by name.
             setup: The set-up.
             up: Unit vector (x, z) against gravity; (0, 1) on level ground.
+            foot: Where the foot that stands is moved, (x, z) in m; only a compass gait has one.
         """
 
     @abstractmethod

@@ -24,7 +24,7 @@ class Pendulum(Mechanism):
         Parameter('gravity', 'm/s^2', 'acceleration of gravity', 0.0, 30.0, free=False),
     )
 
-    def energies(self, q, v, p: Symbols, setup, up):
+    def energies(self, q, v, p: Symbols, setup, up, foot=None):
         """T = J v^2 / 2; V = -m g l (up . d(q)): the mass hangs against `up`."""
         return (
             p['inertia'] * v[0] ** 2 / 2,

@@ -1,0 +1,34 @@
+"""Dry friction that differs by direction."""
+
+import casadi as ca
+
+from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+
+class AsymmetricFriction(Effect):
+    """-excess s (1 + s) / 2 with s = tanh(rate / transition_rate): only while turning forward.
+
+    On top of the Coulomb level; a negative excess makes the forward level the lower one.
+    """
+
+    name = 'asymmetric_friction'
+    place = 'joint'
+    summary = (
+        'Dry friction is higher one way than the other: -excess s (1 + s)/2 with '
+        's = tanh(rate / transition_rate), on top of the Coulomb level.'
+    )
+    parameters = (
+        Parameter(
+            'excess', 'N m', 'forward less backward level of dry friction', -50.0, 50.0,
+            neutral=0.0, starts=(0.01, 0.5), scale=0.02,
+        ),
+        TRANSITION_RATE,
+    )  # fmt: skip
+    largest_step = 0.002
+
+    def joint_torque(self, angle, rate, load, z, p):
+        """Against the rate, where that is positive."""
+        s = ca.tanh(rate / p['transition_rate'])
+        return -p['excess'] * s * (1 + s) / 2, []

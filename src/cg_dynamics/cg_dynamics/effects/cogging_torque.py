@@ -1,0 +1,34 @@
+"""Torque that ripples with the angle of the joint."""
+
+import casadi as ca
+
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+
+class CoggingTorque(Effect):
+    """tau = tau_motor + amplitude sin(cycles angle + phase), before any flexibility."""
+
+    name = 'cogging_torque'
+    place = 'transmission'
+    summary = (
+        'Magnets or teeth pull the joint to certain angles: a torque '
+        'amplitude sin(cycles angle + phase) adds to the motor torque.'
+    )
+    parameters = (
+        Parameter(
+            'amplitude', 'N m', 'of the ripple', -20.0, 20.0,
+            neutral=0.0, starts=(0.2,), scale=0.02,
+        ),
+        Parameter(
+            'cycles', '1', 'per revolution of the joint', 1.0, 400.0,
+            starts=(10.0, 14.0, 20.0, 28.0, 38.0, 50.0, 7.0, 4.0), scale=0.2, logarithmic=True,
+        ),
+        Parameter(
+            'phase', 'rad', 'of the ripple at joint angle 0', -6.3, 6.3, starts=(0.0,), scale=0.1
+        ),
+    )  # fmt: skip
+
+    def transmit(self, torque, angle, rate, z, p):
+        """Motor torque and ripple."""
+        return torque + p['amplitude'] * ca.sin(p['cycles'] * angle + p['phase']), []

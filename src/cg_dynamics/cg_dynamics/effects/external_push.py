@@ -1,0 +1,46 @@
+"""Somebody pushes the robot once."""
+
+import math
+
+import casadi as ca
+
+from cg_dynamics.effects.effect import TIME, StanceEffect
+from cg_dynamics.parameter import Parameter
+
+
+class ExternalPush(StanceEffect):
+    """A horizontal force at the hip, a pulse over the time of the record.
+
+    F(t) = impulse exp(-((t - instant) / duration)^2 / 2) / (sqrt(2 pi) duration)       (PUSH)
+
+    at the same time in every record: a machine pushes, not a passer-by.
+    """
+
+    name = 'external_push'
+    summary = (
+        'Something pushes the hip forward once in each record: a smooth pulse of force around '
+        'an instant, with a given impulse.'
+    )
+    parameters = (
+        Parameter(
+            'impulse', 'N s', 'integral of the force, positive forward', -200.0, 200.0,
+            neutral=0.0, starts=(0.5,), scale=0.1,
+        ),
+        Parameter(
+            'instant', 's', 'time of the greatest force from the start of the record', 0.0, 3600.0,
+            starts=(0.5, 1.5, 2.5, 3.5, 5.0, 7.0, 10.0, 15.0), scale=0.05,
+        ),
+        Parameter(
+            'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,
+            starts=(0.1,), scale=0.02, logarithmic=True,
+        ),
+    )  # fmt: skip
+    extra_inputs = (TIME,)
+    largest_step = 0.002
+
+    def force(self, body, p):
+        """(PUSH) through the hip's Jacobian."""
+        late = (p[TIME] - p['instant']) / p['duration']
+        pulse = ca.exp(-(late**2) / 2) / (math.sqrt(2 * math.pi) * p['duration'])
+        hip, _ = body.hip()
+        return ca.gradient(hip[0], body.q) * p['impulse'] * pulse

@@ -1,0 +1,39 @@
+"""Friction that changes while the machine warms up."""
+
+import casadi as ca
+
+from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
+from cg_dynamics.effects.effect import TIME, Effect
+from cg_dynamics.parameter import Parameter
+
+
+class FrictionDrift(Effect):
+    """-excess exp(-time / time_constant) tanh(rate / transition_rate).
+
+    It comes on top of the Coulomb level. A negative excess is friction that grows.
+    """
+
+    name = 'friction_drift'
+    place = 'joint'
+    summary = (
+        'Grease warms up: dry friction starts off by an excess that fades with the time of the '
+        'record, -excess exp(-time / time_constant) tanh(rate / transition_rate).'
+    )
+    parameters = (
+        Parameter(
+            'excess', 'N m', 'dry friction at the start less that at the end', -50.0, 50.0,
+            neutral=0.0, starts=(0.02, 0.5), scale=0.02,
+        ),
+        Parameter(
+            'time_constant', 's', 'time in which the excess fades to 1/e', 0.2, 600.0,
+            starts=(2.0, 10.0), scale=0.5, logarithmic=True,
+        ),
+        TRANSITION_RATE,
+    )  # fmt: skip
+    extra_inputs = (TIME,)
+    largest_step = 0.002
+
+    def joint_torque(self, angle, rate, load, z, p):
+        """Against the rate, less and less."""
+        level = p['excess'] * ca.exp(-p[TIME] / p['time_constant'])
+        return -level * ca.tanh(rate / p['transition_rate']), []

@@ -1,0 +1,35 @@
+"""Dry friction that varies with the angle of the joint."""
+
+import casadi as ca
+
+from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+
+class PositionDependentFriction(Effect):
+    """-torque (1 + cos(angle - tightest)) / 2 tanh(rate / transition_rate)."""
+
+    name = 'position_dependent_friction'
+    place = 'joint'
+    summary = (
+        'A bearing or gear that runs out of true rubs most at one angle: '
+        '-torque (1 + cos(angle - tightest))/2 tanh(rate / transition_rate).'
+    )
+    parameters = (
+        Parameter(
+            'torque', 'N m', 'extra dry friction where it is tightest', 0.0, 50.0,
+            neutral=0.0, starts=(0.05, 1.0), scale=0.05,
+        ),
+        Parameter(
+            'tightest', 'rad', 'joint angle of most friction', -6.3, 6.3,
+            starts=(1.5, -1.5, 0.0), scale=0.1,
+        ),
+        TRANSITION_RATE,
+    )  # fmt: skip
+    largest_step = 0.002
+
+    def joint_torque(self, angle, rate, load, z, p):
+        """Against the rate."""
+        level = p['torque'] * (1 + ca.cos(angle - p['tightest'])) / 2
+        return -level * ca.tanh(rate / p['transition_rate']), []

@@ -1,0 +1,40 @@
+"""Dry friction that gives way like a spring before it slides."""
+
+import casadi as ca
+
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.parameter import Parameter
+
+SLIDING_RATE = 0.01  # rad/s; a joint faster than this at the start is sliding already
+
+
+class PreslidingFriction(Effect):
+    """Dahl's model: -torque b with bristles that bend, db/dt = (rate - |rate| b) / deflection."""
+
+    name = 'presliding_friction'
+    place = 'joint'
+    summary = (
+        'Dry friction that first yields like a spring (Dahl): -torque b, '
+        'db/dt = (rate - |rate| b) / deflection.'
+    )
+    parameters = (
+        Parameter(
+            'torque', 'N m', 'level of dry friction once it slides', 0.0, 50.0,
+            neutral=0.0, starts=(0.01, 0.5), scale=0.02,
+        ),
+        Parameter(
+            'deflection', 'rad', 'angle over which friction builds up', 2e-3, 1.0,
+            starts=(0.01, 0.05), scale=0.005, logarithmic=True,
+        ),
+    )  # fmt: skip
+    states = ('bristle',)
+    largest_step = 0.0005
+
+    def joint_torque(self, angle, rate, load, z, p):
+        """Bent bristles pull back."""
+        bent = z[0]
+        return -p['torque'] * bent, [(rate - ca.fabs(rate) * bent) / p['deflection']]
+
+    def initial_states(self, angle, rate, torque, p):
+        """Fully bent where the joint moves, relaxed where it rests."""
+        return [ca.tanh(rate / SLIDING_RATE)]
