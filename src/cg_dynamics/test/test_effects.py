@@ -9,7 +9,6 @@ from cg_dynamics.compiled import compile_model, simulate
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.rig import Setup
-from conftest import SPRINGS
 
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]
@@ -73,8 +72,8 @@ def test_formula_of_the_effect_vanishes_at_the_neutral_value(bare, name, site, m
 
 
 @pytest.mark.parametrize(('name', 'site'), EVERYWHERE)
-def test_effect_at_its_default_changes_something(bare, name, site):
-    model, setup = bare.with_effect(name, at=site), Setup(springs=SPRINGS)
+def test_effect_at_its_default_changes_something(bare, springs, name, site):
+    model, setup = bare.with_effect(name, at=site), Setup(springs=springs)
     changed = simulate(model, setup, TIME, torque_of(model), START)[1]
     plain = simulate(bare, setup, TIME, TORQUE, START)[1]
     assert np.abs(changed - plain).max() > 1e-7
