@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from cg_sysid.bags import parse_note
+from cg_sysid.report.wording import left_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
 BAD_INPUT = 2
@@ -131,6 +132,12 @@ def print_gain(console: Console, facts: Facts) -> None:
             plain_unit(gain['unit']), f'{gain["ratio"]:.3g} x' if gain['ratio'] else '',
         )  # fmt: skip
     console.print(table)
+
+
+def print_leftover(console: Console, facts: Facts) -> None:
+    """What an error above the noise looks like."""
+    for channel, words in left_words(facts).items():
+        console.print(f'  [bold]left in {channel}[/]: {words}', highlight=False)
 
 
 def print_causes(console: Console, facts: Facts) -> None:

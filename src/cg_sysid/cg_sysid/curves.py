@@ -17,6 +17,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
+from cg_sysid.faults import FaultSignal, as_arrays, from_arrays
 from cg_sysid.trial import Trial, sensor_matrix
 
 FILE_NAME = 'curves.npz'
@@ -99,12 +100,15 @@ def _simulated(
     return compiled.outputs(trial.time, trial.inputs, states, p), states
 
 
-def save(curves: Sequence[Curve], directory: str | Path) -> Path:
+def save(
+    curves: Sequence[Curve], directory: str | Path, faults: Sequence[FaultSignal] = ()
+) -> Path:
     """Write curves.npz, whole or not at all; plain arrays only."""
     arrays: dict[str, Any] = {
         'format': np.array(FORMAT),
         'names': np.array([c.name for c in curves], dtype=np.str_),
         'roles': np.array([c.role for c in curves], dtype=np.str_),
+        **as_arrays(faults),
     }
     for k, curve in enumerate(curves):
         for signal in SIGNALS:
@@ -129,24 +133,25 @@ def save(curves: Sequence[Curve], directory: str | Path) -> Path:
     return path
 
 
-def load(directory: str | Path) -> list[Curve]:
-    """Read curves.npz; an empty list where there is none.
+def load(directory: str | Path) -> tuple[list[Curve], list[FaultSignal]]:
+    """Read curves.npz; empty lists where there is none.
 
     Raises:
         ValueError: The file is not of this format.
     """
     path = Path(directory) / FILE_NAME
     if not path.is_file():
-        return []
+        return [], []
     try:
         with np.load(path, allow_pickle=False) as arrays:
             if str(arrays['format']) != FORMAT:
                 raise ValueError(f'format is {arrays["format"]}, expected {FORMAT}')
-            return [
+            found = [
                 Curve(str(name), str(role), *(arrays[f'{k}/{signal}'] for signal in SIGNALS))
                 for k, (name, role) in enumerate(
                     zip(arrays['names'], arrays['roles'], strict=True)
                 )
             ]
+            return found, from_arrays(arrays)
     except Exception as error:  # zipfile and zlib have their own kinds
         raise ValueError(f'{path}: not a file of curves: {error}') from None

@@ -20,6 +20,7 @@ from cg_dynamics.model import Model
 from cg_sysid import cli, curves
 from cg_sysid.diagnose import Diagnosis, Options, diagnose
 from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
+from cg_sysid.faults import FaultSignal
 from cg_sysid.intake import Intake, take_in
 from cg_sysid.provenance import provenance
 from cg_sysid.record import Record
@@ -103,11 +104,12 @@ def work(options: argparse.Namespace) -> int:
             answer = diagnose(
                 model, intake.records, _options(options, effects, intake), bars
             )
-            facts = diagnosis_facts(answer, intake, origin)
             lines = diagnosis_curves(answer)
+            facts = diagnosis_facts(answer, intake, origin, lines)
         options.out.mkdir(parents=True, exist_ok=True)
         bars('writing the report', 0, 1)
-        write_results(options.out, facts, lines, answer)
+        faults = [signal for source in intake.sources for signal in source.signals]
+        write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
     show(Console(), facts, options.out, options.quiet)
@@ -199,11 +201,15 @@ def diagnosis_curves(answer: Diagnosis) -> list[curves.Curve]:
 
 
 def write_results(
-    directory: Path, facts: Facts, lines: list[curves.Curve], answer: Diagnosis | None
+    directory: Path,
+    facts: Facts,
+    lines: list[curves.Curve],
+    faults: list[FaultSignal],
+    answer: Diagnosis | None,
 ) -> None:
     """Everything that a diagnosis leaves behind."""
     write_facts(facts, directory)
-    curves.save(lines, directory)
+    curves.save(lines, directory, faults)
     if answer is not None:
         extended_model(answer, facts).save(directory / 'model.yaml')
     else:
@@ -238,6 +244,7 @@ def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
     if not quiet:
         cli.print_causes(console, facts)
         cli.print_gain(console, facts)
+        cli.print_leftover(console, facts)
         cli.print_findings(console, facts['findings'])
     console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
 

@@ -15,10 +15,12 @@ import numpy as np
 from cg_description.model_file import write_atomically
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
+from cg_sysid.curves import Curve
 from cg_sysid.diagnose import Candidate, Cause, Diagnosis, Round
 from cg_sysid.findings import Finding
 from cg_sysid.identify import Fit, Unknown
 from cg_sysid.intake import Intake
+from cg_sysid.leftover import leftover
 from cg_sysid.trial import Trial
 
 DIAGNOSIS = 'cg_diagnosis/1'
@@ -30,13 +32,20 @@ INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 Facts = dict[str, Any]
 
 
-def diagnosis_facts(diagnosis: Diagnosis, intake: Intake, provenance: Mapping[str, Any]) -> Facts:
+def diagnosis_facts(
+    diagnosis: Diagnosis,
+    intake: Intake,
+    provenance: Mapping[str, Any],
+    curves: Sequence[Curve] = (),
+) -> Facts:
     """The facts of a diagnosis.
 
     Args:
         diagnosis: The answer.
         intake: The bags behind it.
         provenance: See provenance.py.
+        curves: Measured and simulated signals; from those held out the character of the
+            remaining error is read.
     """
     trials = (*diagnosis.train, *diagnosis.held)
     roles = ('train',) * len(diagnosis.train) + ('held',) * len(diagnosis.held)
@@ -52,7 +61,11 @@ def diagnosis_facts(diagnosis: Diagnosis, intake: Intake, provenance: Mapping[st
             g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in diagnosis.gains
         },
         'remaining_error': {
-            channel: {'chi2_per_sample': chi2, 'in_noise': math.sqrt(max(chi2, 0.0))}
+            channel: {
+                'chi2_per_sample': chi2,
+                'in_noise': math.sqrt(max(chi2, 0.0)),
+                **_character(diagnosis.nominal, channel, curves),
+            }
             for channel, chi2 in diagnosis.remaining.items()
             if channel in {g.channel for g in diagnosis.gains}
         },
@@ -100,6 +113,7 @@ def identification_facts(
     intake: Intake,
     method: str,
     provenance: Mapping[str, Any],
+    curves: Sequence[Curve] = (),
 ) -> Facts:
     """The facts of an identification.
 
@@ -111,6 +125,7 @@ def identification_facts(
         intake: The bags behind them.
         method: Name of the method.
         provenance: See provenance.py.
+        curves: Measured and simulated signals.
     """
     sigma = trials[0].sigma
     total = fit.count.sum(axis=0)
@@ -136,7 +151,11 @@ def identification_facts(
         'causes': [],
         'gain': gain,
         'remaining_error': {
-            channel: {'chi2_per_sample': float(a**2), 'in_noise': float(a)}
+            channel: {
+                'chi2_per_sample': float(a**2),
+                'in_noise': float(a),
+                **_character(model, channel, curves),
+            }
             for (channel, _), a, n in zip(outputs, after, total, strict=True)
             if n
         },
@@ -166,6 +185,13 @@ def _head(form: str, verdict: str, summary: str, model: Model) -> Facts:
         ],
         'inputs': list(model.mechanism.inputs),
     }
+
+
+def _character(model: Model, channel: str, curves: Sequence[Curve]) -> Facts:
+    """What the remaining error of an output looks like."""
+    j = model.mechanism.outputs.index(channel)
+    judged = [curve for curve in curves if curve.role != 'train']
+    return leftover(judged, j, model.mechanism.output_units[j], model.mechanism.inputs)
 
 
 def _rms(mse: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -83,12 +83,14 @@ def work(options: argparse.Namespace) -> int:
             },
             options.date,
         )  # fmt: skip
+        lines = _curves(model, before, found, trials)
         facts = identification_facts(
-            model, found, before, trials, intake, options.method, origin
+            model, found, before, trials, intake, options.method, origin, lines
         )
         options.out.mkdir(parents=True, exist_ok=True)
         write_facts(facts, options.out)
-        curves.save(_curves(model, before, found, trials), options.out)
+        faults = [signal for source in intake.sources for signal in source.signals]
+        curves.save(lines, options.out, faults)
         identified_model(model, found, facts, intake).save(options.out / 'model.yaml')
         write_report(options.out)
     cli.print_left_out(facts)

@@ -9,6 +9,7 @@ from typing import Any
 from cg_sysid.bags import read_raw, to_record
 from cg_sysid.check import check_recording
 from cg_sysid.errors import RecordingError
+from cg_sysid.faults import FaultSignal, fault_signals
 from cg_sysid.findings import CheckReport, Finding, make_report
 from cg_sysid.record import Record
 
@@ -28,6 +29,7 @@ class Source:
         sha256: Hash over its storage files; empty where there is none to read.
         check: What the check says.
         reason: Why it was left out; empty if it is used.
+        signals: Signals around its faults.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Source:
     sha256: str
     check: CheckReport
     reason: str = ''
+    signals: tuple[FaultSignal, ...] = ()
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -145,7 +148,8 @@ def _take(
         finding = Finding('unreadable', 'error', '', _without_path(str(error), path))
         return Source(name, str(path), digest, make_report(name, [finding]), finding.message), None
     if record is None:
-        return Source(name, str(path), digest, report, _reason(report)), None
+        signals = fault_signals(raw, report)
+        return Source(name, str(path), digest, report, _reason(report), signals), None
     return Source(name, str(path), digest, report), _named(record, name)
 
 

@@ -113,14 +113,15 @@ def test_unusable_facts_have_the_same_fields(facts, intake, model_file):
 )
 def test_a_wrong_file_is_refused(tmp_path, text, error):
     (tmp_path / 'diagnosis.json').write_text(text)
-    with pytest.raises(ValueError, match='diagnosis.json') as caught:
+    with pytest.raises(ValueError, match=r'diagnosis\.json') as caught:
         read_facts(tmp_path)
     assert error in str(caught.value)
 
 
 def test_curves_come_back(tmp_path, lines):
     curves.save(lines, tmp_path)
-    back = curves.load(tmp_path)
+    back, faults = curves.load(tmp_path)
+    assert faults == []
     assert [(c.name, c.role) for c in back] == [(c.name, c.role) for c in lines]
     np.testing.assert_array_equal(back[0].time, lines[0].time)
     np.testing.assert_allclose(back[0].after, lines[0].after, rtol=1e-6, atol=1e-7)

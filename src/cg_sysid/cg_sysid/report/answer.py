@@ -3,7 +3,7 @@
 import math
 
 from cg_sysid.report.markup import Markup, tag
-from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, parameter_words
+from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, left_words, parameter_words
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
 
 PLACES = {
@@ -18,23 +18,26 @@ PLACES = {
 }
 
 
-def answer(facts: Facts) -> Markup:
+def answer(facts: Facts, drawn: Facts) -> Markup:
     """The answer in words, the causes and the gain."""
     verdict = facts['verdict']
     left = [
         *[_cause(cause) for cause in facts['causes']],
-        _faults(facts),
+        _faults(facts, drawn),
+        _where(facts),
         _left_out(facts),
-        _notes(facts),
     ]
     left = [part for part in left if part is not None]
-    right = gain(facts)
-    both = bool(left) and right is not None
+    right = [part for part in (gain(facts),) if part is not None]
+    notes = _notes(facts)
+    if notes is not None:
+        (right if left else left).append(notes)
+    both = bool(left) and bool(right)
     return tag('div',
         tag('span', verdict, class_='verdict', title=VERDICTS[verdict]),
         tag('h1', sentence(headline(facts))),
         tag('p', lead(facts), class_='lead'),
-        tag('div', tag('div', left) if left else None, right,
+        tag('div', tag('div', left) if left else None, tag('div', right) if right else None,
             class_='columns' if both else 'columns one'),
         class_=f'hero {verdict}', id='answer',
     )  # fmt: skip
@@ -63,7 +66,7 @@ def _cause(cause: Facts) -> Markup:
     )  # fmt: skip
 
 
-def _faults(facts: Facts) -> Markup | None:
+def _faults(facts: Facts, drawn: Facts) -> Markup | None:
     """Where the recordings are broken, if that is the story."""
     if facts['verdict'] != 'unusable':
         return None
@@ -78,7 +81,7 @@ def _faults(facts: Facts) -> Markup | None:
             parts.append(tag('div',
                 tag('b', where or 'the whole recording'),
                 tag('p', sentence(f['message']), '.'),
-                tag('span', f['code'], class_='mono soft'),
+                _plot(drawn, source['name'], f),
                 class_='fault',
             ))  # fmt: skip
     used = [s['name'] for s in facts['sources'] if s['used']]
@@ -88,13 +91,35 @@ def _faults(facts: Facts) -> Markup | None:
     return tag('div', parts, class_='card')
 
 
+def _plot(drawn: Facts, source: str, finding: Facts) -> Markup | None:
+    """The signal around a fault, where there is one."""
+    for k, signal in enumerate(drawn['faults']):
+        if (signal['source'], signal['code']) == (source, finding['code']) and (
+            signal['span'][0] == finding['start_s']
+        ):
+            return tag('div', class_='faultplot', data_index=k)
+    return None
+
+
+def _where(facts: Facts) -> Markup | None:
+    """What an error that nothing explains looks like."""
+    words = left_words(facts)
+    if not words or facts['verdict'] == 'unusable':
+        return None
+    return tag('div',
+        tag('h3', 'Where an error is left'),
+        [tag('p', tag('b', channel), f': {text}.') for channel, text in words.items()],
+        class_='card',
+    )  # fmt: skip
+
+
 def _left_out(facts: Facts) -> Markup | None:
     if facts['verdict'] == 'unusable' or not facts['unusable']:
         return None
     return tag('div',
         tag('h3', 'Left out'),
         tag('p', 'These recordings are broken; the answer stands on the others.', class_='soft'),
-        [tag('div', tag('b', u['name']), tag('p', sentence(u['reason'])), class_='fault')
+        [tag('div', tag('b', u['name']), tag('p', u['reason']), class_='fault')
          for u in facts['unusable']],
         class_='card',
     )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 from cg_description.model_file import write_atomically
 from cg_sysid.curves import Curve, load
 from cg_sysid.diagnosis_file import FILE_NAMES, Facts, read_facts
+from cg_sysid.faults import FaultSignal
 from cg_sysid.report import answer, data, fits, tried
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.signals import payload
@@ -30,7 +31,7 @@ def write_report(directory: str | Path, out: str | Path | None = None) -> Path:
     """
     facts = read_facts(directory)
     try:
-        page = render(facts, load(directory))
+        page = render(facts, *load(directory))
     except KeyError as error:
         raise ValueError(
             f'{directory}: the results lack {error}; were they written by another version?'
@@ -40,18 +41,21 @@ def write_report(directory: str | Path, out: str | Path | None = None) -> Path:
     return path
 
 
-def render(facts: Facts, curves: Sequence[Curve]) -> str:
+def render(
+    facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()
+) -> str:
     """The page as text.
 
     Args:
         facts: As diagnosis_file.py builds them.
         curves: Measured and simulated signals, those that judge first; may be empty.
+        faults: Signals around the faults of broken recordings.
     """
-    drawn = payload(facts, curves)
+    drawn = payload(facts, curves, faults)
     sections = [
         section
         for section in (
-            ('answer', 'Answer', answer.answer(facts)),
+            ('answer', 'Answer', answer.answer(facts, drawn)),
             ('signals', 'Measured and simulated', fits.viewer(facts, drawn)),
             ('residuals', 'What is left', fits.residuals(facts, drawn)),
             ('tried', 'What was tried', tried.rounds(facts)),

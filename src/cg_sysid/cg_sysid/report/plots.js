@@ -433,7 +433,26 @@
       y: { lo: -1.08 * top * k, hi: 1.08 * top * k, label: 'residual in ' + unit } });
   }
 
+  // --- faults of a recording ----------------------------------------------------------------
+  function fault(host) {
+    const s = data.faults[Number(host.dataset.index)];
+    const t = times(s.time), values = decoded(s.values);
+    if (!values) return;
+    const range = extent([values], 0, values.length);
+    const [k, unit] = scaled(Math.max(Math.abs(range[0]), Math.abs(range[1])), s.unit);
+    const y = padded([range[0] * k, range[1] * k], 0.12, 1e-9);
+    const x = { lo: t[0], hi: t[t.length - 1], label: 'time in s' };
+    const least = (x.hi - x.lo) / 150, middle = (s.span[0] + s.span[1]) / 2;
+    const half = Math.max(least, s.span[1] - s.span[0]) / 2;
+    const a = middle - half, b = middle + half;
+    chart(host, { height: 190, title: s.channel + ' around the fault', x: x,
+      bands: [{ x: [a, b], lo: [y[0], y[0]], hi: [y[1], y[1]], cls: 'faulty' }],
+      lines: [{ x: t, y: times1(values, k), cls: 'raw' }],
+      y: { lo: y[0], hi: y[1], label: s.channel + ' in ' + (unit || '1') } });
+  }
+
   function drawAll() {
+    document.querySelectorAll('.faultplot').forEach(fault);
     document.querySelectorAll('.spectrum').forEach(spectrum);
     document.querySelectorAll('.against').forEach(against);
   }

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.signal import welch
 
 from cg_sysid.curves import Curve
+from cg_sysid.faults import FaultSignal
 
 MISSING = 0xFFFF
 STEPS = 0xFFFE
@@ -21,7 +22,9 @@ LONGEST_SEGMENT = 2048
 Facts = dict[str, Any]
 
 
-def payload(facts: Facts, curves: Sequence[Curve]) -> Facts:
+def payload(
+    facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()
+) -> Facts:
     """Everything that the scripts of the page draw."""
     channels = [
         {**channel, 'sigma': facts['noise_floor'].get(channel['name'])}
@@ -35,6 +38,7 @@ def payload(facts: Facts, curves: Sequence[Curve]) -> Facts:
         'channels': channels,
         'inputs': facts['inputs'],
         'thinned': every,
+        'faults': [_fault(signal) for signal in faults],
         'records': [_record(curve, every) for curve in shown],
         'spectra': {
             channel['name']: spectra(judged, j, channel['sigma'])
@@ -44,6 +48,19 @@ def payload(facts: Facts, curves: Sequence[Curve]) -> Facts:
             channel['name']: by_state(judged, j, facts['inputs'])
             for j, channel in enumerate(channels)
         },
+    }
+
+
+def _fault(signal: FaultSignal) -> Facts:
+    every = max(1, len(signal.time) // 4000)
+    return {
+        'source': signal.source,
+        'channel': signal.channel,
+        'unit': signal.unit,
+        'code': signal.code,
+        'span': [signal.start, signal.stop],
+        'time': _times(signal.time[::every]),
+        'values': quantised(signal.values[::every]),
     }
 
 

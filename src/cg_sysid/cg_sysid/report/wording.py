@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from cg_sysid.leftover import followed
 from cg_sysid.text import effect_name, listed, measured, number, scaled
 
 Facts = dict[str, Any]
@@ -13,6 +14,12 @@ VERDICTS = {
     'unexplained': 'Something is missing that no known effect explains.',
     'unusable': 'The recordings themselves are broken.',
     'identified': 'Parameters of the model as given, fitted to the recordings.',
+}
+ABOVE_NOISE = 2.0  # multiples of the sensor noise from which an error is spoken of
+HINTS = {
+    'angle': 'as a missing or wrong force that depends on position would',
+    'rate': 'as friction or damping would',
+    'torque': 'as an error on the way of the torque would',
 }
 FIXTURES = {
     'inner_fixed': 'inner legs fixed', 'outer_fixed': 'outer legs fixed', 'legs_tied': 'legs tied',
@@ -65,16 +72,40 @@ def lead(facts: Facts) -> str:
         )
         if verdict == 'ambiguous':
             text += ' These recordings cannot tell the alternatives apart.'
-        above = [c for c, e in facts['remaining_error'].items() if (e['in_noise'] or 0) > 2]
+        above = list(left_words(facts))
         if above:
             text += f' An error above the noise remains in {listed(above)}.'
         return text
     if verdict == 'consistent':
         return f'On held-out recordings the error of {channel} is {left}.'
+    tried = facts['provenance'].get('options', {}).get('effects', 'all')
+    which = 'nothing in the library of effects' if tried == 'all' else f'no effect tried ({tried})'
     return (
-        f'The simulation misses {channel} by {left} on held-out recordings, and nothing in the '
-        'library of effects removes that.'
+        f'The simulation misses {channel} by {left} on held-out recordings, and {which} removes '
+        'that.'
     )
+
+
+def left_words(facts: Facts) -> dict[str, str]:
+    """Output -> what its remaining error looks like, for those above the noise."""
+    found = {}
+    for channel, error in facts['remaining_error'].items():
+        if (error['in_noise'] or 0.0) <= ABOVE_NOISE:
+            continue
+        words = [f'{number(error["in_noise"], 2)} times the sensor noise']
+        frequency = error.get('median_frequency_hz')
+        if frequency:
+            words.append(f'half of its power below {number(frequency, 2)} Hz')
+        follows = error.get('follows') or {}
+        name = followed(follows)
+        if name:
+            share, hint = f'{100 * follows[name]:.0f} %', HINTS.get(name, HINTS['torque'])
+            quantity = name.replace('_', ' ')
+            words.append(f'its acceleration follows the {quantity} ({share}), {hint}')
+        elif follows:
+            words.append('its acceleration follows neither angle nor rate nor torque alone')
+        found[channel] = '; '.join(words)
+    return found
 
 
 def best_channel(facts: Facts) -> str:
