@@ -380,7 +380,7 @@ class _Search:
         accepted: list[Outcome] = []
         while len(accepted) < self.options.rounds and not self._at_noise(base):
             ranked, independent = self._round(base)
-            best = next((c for c in ranked if not c[0].reason), None)
+            best = self._choose(ranked, independent)
             self.rounds.append(
                 Round(
                     ' + '.join(['nominal', *(o.label for o in accepted)]),
@@ -431,6 +431,22 @@ class _Search:
         ranked.sort(key=lambda pair: -pair[0].evidence)
         return ranked, independent
 
+    def _choose(
+        self, ranked: list[tuple[Candidate, Outcome]], independent: float
+    ) -> tuple[Candidate, Outcome] | None:
+        """The best candidate that may be accepted, or a simpler one that it contains."""
+        able = [pair for pair in ranked if not pair[0].reason]
+        if not able:
+            return None
+        leader = able[0][0]
+        simpler = [
+            pair
+            for pair in able
+            if _name(pair[0].label) in LIBRARY[_name(leader.label)].contains
+            and pair[0].evidence > leader.evidence - _margin(independent)
+        ]
+        return simpler[0] if simpler else able[0]
+
     def _evidence(self, o: Outcome, independent: float) -> float:
         samples = o.train.count.sum() + o.held.count.sum()
         return evidence(_chi2(o), samples, independent, o.unknowns, o.belief)
@@ -476,7 +492,8 @@ class _Search:
         labels = [o.label for o in accepted]
         if len(accepted) == 1:
             # The first round has already asked.
-            return [self._cause(final, labels[0], self.rounds[0].candidates)], final
+            first = self.rounds[0]
+            return [self._cause(final, labels[0], first.candidates, first.independent)], final
         causes = []
         for label in labels:
             without = final.model.without_effect(label)
@@ -488,26 +505,31 @@ class _Search:
             candidates = tuple(c for c, _ in ranked)
             base = ' + '.join(['nominal', *(x for x in labels if x != label)])
             self.rounds.append(Round(base, candidates, label, independent))
-            causes.append(self._cause(final, label, candidates))
+            causes.append(self._cause(final, label, candidates, independent))
         causes.sort(key=lambda cause: -cause.evidence)
         return causes, final
 
-    def _cause(self, final: Outcome, label: str, candidates: Sequence[Candidate]) -> Cause:
+    def _cause(
+        self, final: Outcome, label: str, candidates: Sequence[Candidate], independent: float
+    ) -> Cause:
         own = next(c for c in candidates if c.label == label)
-        samples = own.train.count.sum() + own.held.count.sum()
-        margin = max(MARGIN, FIDELITY * samples / 2)
+        margin = _margin(independent)
         close = [
             c.label
             for c in candidates
             if c.label != label and not c.reason and c.evidence > own.evidence - margin
         ]
-        name = label.partition('@')[0]
+        name = _name(label)
         return Cause(
             label,
             _parameters_of(final, label),
             own.evidence,
-            rivals=tuple(c for c in close if c.partition('@')[0] != name),
-            places=tuple(c for c in close if c.partition('@')[0] == name),
+            rivals=tuple(
+                c
+                for c in close
+                if _name(c) != name and name not in LIBRARY[_name(c)].contains
+            ),
+            places=tuple(c for c in close if _name(c) == name),
         )
 
     def _conclude(self, nominal: Outcome, final: Outcome, causes: list[Cause]) -> Diagnosis:
@@ -538,6 +560,16 @@ class _Search:
             remaining={c: float(v) for c, v in remaining.items()},
             findings=tuple(final.train.warnings),
         )
+
+
+def _name(label: str) -> str:
+    """Standard name of an effect, its place left out."""
+    return label.partition('@')[0]
+
+
+def _margin(independent: float) -> float:
+    """Evidence in nats by which rivals are not told apart, for so many independent samples."""
+    return max(MARGIN, FIDELITY * independent / 2)
 
 
 def _chi2(o: Outcome) -> float:

@@ -21,6 +21,7 @@ class Backlash(Effect):
         'Play in the gear: the rotor turns freely within the gap and pushes the joint only '
         'where teeth touch.'
     )
+    contains = ('rotor_inertia',)
     parameters = (
         Parameter(
             'gap', 'rad', 'total play at the joint', 2e-4, 0.3,

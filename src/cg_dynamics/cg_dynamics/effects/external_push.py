@@ -21,6 +21,7 @@ class ExternalPush(StanceEffect):
         'Something pushes the hip forward once in each record: a smooth pulse of force around '
         'an instant, with a given impulse.'
     )
+    contains = ('tether_force',)
     parameters = (
         Parameter(
             'impulse', 'N s', 'integral of the force, positive forward', -200.0, 200.0,

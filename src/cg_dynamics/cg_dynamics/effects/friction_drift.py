@@ -19,6 +19,7 @@ class FrictionDrift(Effect):
         'Grease warms up: dry friction starts off by an excess that fades with the time of the '
         'record, -excess exp(-time / time_constant) tanh(rate / transition_rate).'
     )
+    contains = ('coulomb_friction',)
     parameters = (
         Parameter(
             'excess', 'N m', 'dry friction at the start less that at the end', -50.0, 50.0,

@@ -17,6 +17,7 @@ class JointFlexibility(Effect):
         'Rotor and joint are coupled by a spring: J dw/dt = tau_motor - tau_joint, '
         'tau_joint = k (a - angle) + d (w - rate).'
     )
+    contains = ('rotor_inertia',)
     parameters = (
         Parameter(
             'stiffness', 'N m/rad', 'k', 0.05, 1e5,

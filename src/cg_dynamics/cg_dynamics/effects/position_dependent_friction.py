@@ -16,6 +16,7 @@ class PositionDependentFriction(Effect):
         'A bearing or gear that runs out of true rubs most at one angle: '
         '-torque (1 + cos(angle - tightest))/2 tanh(rate / transition_rate).'
     )
+    contains = ('coulomb_friction',)
     parameters = (
         Parameter(
             'torque', 'N m', 'extra dry friction where it is tightest', 0.0, 50.0,

@@ -17,6 +17,7 @@ class PreslidingFriction(Effect):
         'Dry friction that first yields like a spring (Dahl): -torque b, '
         'db/dt = (rate - |rate| b) / deflection.'
     )
+    contains = ('coulomb_friction',)
     parameters = (
         Parameter(
             'torque', 'N m', 'level of dry friction once it slides', 0.0, 50.0,

@@ -16,6 +16,7 @@ class StribeckFriction(Effect):
         'Dry friction that is higher near standstill and fades with rate: '
         '-torque exp(-(rate/stribeck_rate)^2) tanh(rate/transition_rate).'
     )
+    contains = ('coulomb_friction',)
     parameters = (
         Parameter(
             'torque', 'N m', 'breakaway friction above the Coulomb level', 0.0, 50.0,
