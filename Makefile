@@ -1,6 +1,6 @@
 # make setup | build | demo | test | lint | clean
 #
-#   make demo EFFECT=coulomb_friction SEED=3    hide this effect in the simulated robot and find it
+#   make demo EFFECT=torque_constant SEED=3     hide this effect in the simulated robot and find it
 #   make test PACKAGES="cg_sysid cg_dynamics"   only these packages
 #   make setup PYTHON=/usr/bin/python3.12       with this interpreter
 
