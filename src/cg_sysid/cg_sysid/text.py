@@ -39,7 +39,8 @@ def measured(value: float | None, sigma: float | None, unit: str = '1') -> str:
     """A value with its standard deviation to two digits, such as `8.01 ± 0.05 ms`."""
     if value is None:
         return '\u2013'
-    factor, unit = scaled(value, unit)
+    size = max(abs(value), sigma) if sigma is not None and math.isfinite(sigma) else value
+    factor, unit = scaled(size, unit)
     value *= factor
     tail = f' {unit}' if unit else ''
     if sigma is None or not math.isfinite(sigma):
@@ -50,7 +51,8 @@ def measured(value: float | None, sigma: float | None, unit: str = '1') -> str:
     decimals = 1 - math.floor(math.log10(sigma))
     if decimals < 0 or decimals > 7:
         return f'{number(value, 4)} \u00b1 {number(sigma, 2)}{tail}'
-    text = f'{value:.{decimals}f}'.replace('-', MINUS)
+    # Adding 0 turns a negative zero into a plain one.
+    text = f'{round(value, decimals) + 0.0:.{decimals}f}'.replace('-', MINUS)
     return f'{text} \u00b1 {sigma:.{decimals}f}{tail}'
 
 

@@ -172,7 +172,7 @@
     const left = spec.left || MARGIN.left;
     const frame = { x0: left, x1: width - MARGIN.right, y0: height - bottom, y1: MARGIN.top };
     const svg = node('svg', { viewBox: '0 0 ' + width + ' ' + height, width: '100%',
-      height: height, preserveAspectRatio: 'none', role: 'img', 'aria-label': spec.title }, host);
+      role: 'img', 'aria-label': spec.title }, host);
     const px = axis(spec.x, frame.x0, frame.x1), py = axis(spec.y, frame.y0, frame.y1);
     const id = 'clip' + (clips++);
     const clip = node('clipPath', { id: id }, node('defs', {}, svg));
