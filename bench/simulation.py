@@ -11,6 +11,7 @@ of one run are a result.
 """
 
 import argparse
+import importlib
 import importlib.metadata
 import platform
 import resource
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -172,7 +174,7 @@ def mujoco_route(integrator: str) -> Route:
 
 
 def drake_route() -> Route:
-    import pydrake.all as drake
+    drake: Any = importlib.import_module('pydrake.all')
 
     builder = drake.DiagramBuilder()
     plant = drake.MultibodyPlant(0.0)
@@ -314,7 +316,7 @@ def table(repetitions: int) -> str:
         '| route | steps/s | x numpy | x compiled | error at the end |',
         '|---|---:|---:|---:|---:|',
     ]
-    for name in sorted(rates, key=rates.get, reverse=True):
+    for name in sorted(rates, key=lambda name: -rates[name]):
         lines.append(
             f'| {name} | {rates[name]:,.0f} | {rates[name] / slowest:.3g} '
             f'| {rates[name] / ours:.3g} | {errors[name]:.1e} |'

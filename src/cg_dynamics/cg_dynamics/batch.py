@@ -138,7 +138,7 @@ def simulate_batch(
     states = np.empty(shape)
     # C sees addresses only: every array must be held by a name until it returns.
     rows = np.diff(time)
-    pointers = [None] * 3
+    pointers: list[np.ndarray | None] = [None] * 3
     if feedback is not None:
         pointers = [
             np.ascontiguousarray(a, float)

@@ -95,6 +95,7 @@ def find_gait(
         if len(done.impacts) < steps:
             raise GaitError(f'no gait: from s = {s} the walk ends by {done.outcome!r}')
         last = done.impacts[-1].impact
+        assert last is not None, 'an impact event carries its impact'
         return section_coordinates(last.x_plus, last.stance), done
 
     s = np.array(guess, float)

@@ -19,7 +19,7 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import Body
 from cg_dynamics.errors import ModelError
 from cg_dynamics.lagrange import manipulator
-from cg_dynamics.mechanisms.compass_gait import direction, normal
+from cg_dynamics.mechanisms.compass_gait import CompassGait, direction, normal
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
@@ -72,7 +72,7 @@ def unpinned(model: Model, stance: str) -> Unpinned:
         model: Its mechanism must be a compass gait.
         stance: The leg pair whose foot is (x, z), 'inner' or 'outer'.
     """
-    if model.mechanism.name != 'compass_gait':
+    if not isinstance(model.mechanism, CompassGait):
         raise ModelError(f'impacts are those of a compass gait, not of a {model.mechanism.name}')
     setup = Setup(stance=stance)
     names = parameter_names(model, setup)
@@ -107,13 +107,14 @@ def unpinned(model: Model, stance: str) -> Unpinned:
 def ground_reaction(model: Model, stance: str, states: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Force (F_x, F_z) in N of the ground on the stance foot, in the rig frame: shape (n, 2).
 
-    The pinned model holds only while F_z > 0 and |F_x| stays below friction times F_z.
+    The pinned model holds only while F_z > 0 and |F_x| stays below friction times F_z. What else
+    the world pulls or pushes at the robot (a tether, a push) is not told apart from the ground.
 
     Args:
         model: A compass gait.
         stance: The leg pair that stands.
         states: States x, shape (n, nx).
-        u: Hip torques that act, shape (n, 1), N m.
+        u: Inputs that act, the hip torque in N m first, shape (n, nu).
     """
     setup = Setup(stance=stance)
     p = parameter_vector(model, setup)
