@@ -111,9 +111,11 @@ def run_demo(
     if out.exists() and any(out.iterdir()):
         raise ExperimentError(f'{out} is not empty; name another directory with --out')
     start = time.monotonic()
-    nominal_path = model_path(NOMINAL_MODEL)
-    nominal = Model.load(nominal_path)
-    hidden = hide(nominal, effect, seed)
+    robot = Model.load(model_path(NOMINAL_MODEL))
+    hidden = hide(robot, effect, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    nominal_path = out / 'nominal.yaml'
+    hidden.nominal.save(nominal_path)
     # Out of the way of the analysis until it has spoken.
     with tempfile.TemporaryDirectory(prefix='cg_machine_') as directory:
         machine = Path(directory) / 'machine.yaml'
@@ -121,7 +123,7 @@ def run_demo(
         bags = record_programme(console, machine, nominal_path, out / 'bags', seed, duration)
         found = diagnose(console, nominal_path, bags, out)
         shutil.copy(machine, out / 'hidden_machine.yaml')
-    reveal(console, nominal, hidden)
+    reveal(console, robot, hidden)
     console.print(f'\nReport: {out / "report.html"}\nModel:  {out / "model.yaml"}')
     console.print(f'Bags:   {out / "bags"}   ({time.monotonic() - start:.0f} s in all)')
     return found

@@ -23,12 +23,14 @@ class Hidden:
     """What the simulated hardware is, and the analysis does not know.
 
     Attributes:
+        nominal: What the analysis is to believe in.
         model: The machine.
         effect: Name of the hidden effect.
         values: Its parameters, in the units of the effect library.
         factors: Parameter of the nominal model -> true value over nominal value.
     """
 
+    nominal: Model
     model: Model
     effect: str
     values: dict[str, float]
@@ -41,17 +43,19 @@ def hidden_effects_file() -> Path:
 
 
 def hideable_effects(nominal: Model) -> list[str]:
-    """Effects of the file that the library knows and the nominal model does not have yet."""
+    """Effects of the file that the library knows, and those that the nominal model has."""
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
-    present = {effect.label for effect in nominal.effects}
-    return [name for name in table if name in LIBRARY and name not in present]
+    present = [effect.label for effect in nominal.effects]
+    return [name for name in table if name in LIBRARY and name not in present] + present
 
 
 def hide(nominal: Model, effect: str | None, seed: int) -> Hidden:
     """Make the hidden machine.
 
+    An effect that the nominal model has is hidden by leaving it out of the nominal model.
+
     Args:
-        nominal: What the analysis will believe in.
+        nominal: The robot as it is known.
         effect: Effect to hide; None to draw one.
         seed: Of everything that is drawn.
 
@@ -64,10 +68,14 @@ def hide(nominal: Model, effect: str | None, seed: int) -> Hidden:
     name = drawn if effect is None else effect
     if name not in names:
         raise ExperimentError(f'no effect {name!r} to hide; there are: {", ".join(names)}')
+    if any(name == present.label for present in nominal.effects):
+        model, factors = perturb(nominal, rng)
+        values = {p.name: model.values[f'{name}.{p.name}'] for p in LIBRARY[name].parameters}
+        return Hidden(nominal.without_effect(name), model, name, values, factors)
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
     values = draw_values(table[name], rng)
     model, factors = perturb(nominal, rng)
-    return Hidden(model.with_effect(name, None, **values), name, values, factors)
+    return Hidden(nominal, model.with_effect(name, None, **values), name, values, factors)
 
 
 def draw_values(ranges: dict[str, Any], rng: np.random.Generator) -> dict[str, float]:

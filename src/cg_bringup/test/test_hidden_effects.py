@@ -72,28 +72,11 @@ def recorded(machine, seed, directory):
     return records
 
 
-def nominal_and_machine(effect, seed):
-    """What the analysis believes, what the machine is, and the hidden parameters."""
-    nominal = Model.load(model_path(NOMINAL_MODEL))
-    if any(effect == present.label for present in nominal.effects):
-        # Friction that the robot is known to have is hidden by leaving it out of the nominal.
-        machine, _ = perturb(nominal, np.random.default_rng(seed))
-        prefix = f'{effect}.'
-        values = {
-            name.removeprefix(prefix): value
-            for name, value in machine.values.items()
-            if name.startswith(prefix)
-        }
-        return nominal.without_effect(effect), machine, values
-    hidden = hide(nominal, effect, seed)
-    return nominal, hidden.model, hidden.values
-
-
 @pytest.mark.parametrize('effect', FIRST_LIBRARY)
 def test_a_hidden_effect_is_named_and_its_gain_measured(effect, tmp_path):
     seed = 11 + FIRST_LIBRARY.index(effect)
-    nominal, machine, values = nominal_and_machine(effect, seed)
-    found = diagnose(nominal, recorded(machine, seed, tmp_path), Options(workers=2))
+    hidden = hide(Model.load(model_path(NOMINAL_MODEL)), effect, seed)
+    found = diagnose(hidden.nominal, recorded(hidden.model, seed, tmp_path), Options(workers=2))
 
     named = {cause.label.partition('@')[0] for cause in found.causes}
     rivals = {rival.partition('@')[0] for cause in found.causes for rival in cause.rivals}
@@ -105,11 +88,11 @@ def test_a_hidden_effect_is_named_and_its_gain_measured(effect, tmp_path):
     before = found.baseline.held.normalised_error
     after = found.extended.held.normalised_error
     assert after < 1.2**2 < before
-    first = next(iter(values))
+    first = next(iter(hidden.values))
     if found.causes[0].label == effect:
         value, sigma, _ = found.causes[0].parameters[first]
         # Four standard deviations, and a part in a hundred for what no model does better.
-        assert abs(value - values[first]) < 4 * sigma + 0.01 * abs(values[first])
+        assert abs(value - hidden.values[first]) < 4 * sigma + 0.01 * abs(hidden.values[first])
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
