@@ -44,5 +44,7 @@ fi
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
 export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$_cg_root/tools/fastdds_localhost.xml}
 export ROS_LOG_DIR=${ROS_LOG_DIR:-$_cg_root/log/ros}
+# Our matrices are small and our work runs in one process per core: threads of BLAS only get in the way.
+export OPENBLAS_NUM_THREADS=${OPENBLAS_NUM_THREADS:-1}
 
 unset _cg_here _cg_root _cg_package _cg_nounset
