@@ -24,18 +24,15 @@ def counts(report: Path) -> tuple[int, int, int]:
 def main(packages: list[str]) -> int:
     """Print one line per package without tests, then the sum of all."""
     names = packages or sorted(p.parent.name for p in ROOT.glob('src/*/package.xml'))
-    passed = failed = skipped = silent = 0
+    results = []
     for name in names:
         report = ROOT / 'build' / name / 'pytest.xml'
-        result = counts(report) if report.is_file() else (0, 0, 0)
-        if not sum(result):
-            silent += 1
+        results.append(counts(report) if report.is_file() else (0, 0, 0))
+        if not sum(results[-1]):
             print(f'{name}: no test ran')
-        passed, failed, skipped = (
-            passed + result[0], failed + result[1], skipped + result[2]
-        )  # fmt: skip
+    passed, failed, skipped = (sum(column) for column in zip(*results, strict=True))
     print(f'{passed} passed, {failed} failed, {skipped} skipped')
-    return 1 if failed or silent or not passed else 0
+    return 0 if passed and not failed and all(map(sum, results)) else 1
 
 
 if __name__ == '__main__':
