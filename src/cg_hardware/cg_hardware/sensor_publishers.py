@@ -82,35 +82,41 @@ class SensorPublishers:
         """Publish what the sensors said at that time."""
         self._publish_parts(to_stamp(stamp_ns), measurement)
 
+    def _send(self, topic: str, message: Any) -> None:
+        # Asking is eight times cheaper than publishing to nobody.
+        publisher = self.publishers[topic]
+        if publisher.get_subscription_count() > 0:
+            publisher.publish(message)
+
     def publish_applied(self, stamp_ns: int, torque: tuple[float, ...]) -> None:
         """Publish the set-points latched at that time, in N m."""
         self.applied.header.stamp = to_stamp(stamp_ns)
         self.applied.effort = list(torque)
-        self.publishers[topics.APPLIED_TORQUE].publish(self.applied)
+        self._send(topics.APPLIED_TORQUE, self.applied)
 
     def _publish_compass_gait(self, stamp: Any, measurement: Any) -> None:
         self.encoder.header.stamp = stamp
         self.encoder.position = [measurement.outputs['hip_angle']]
-        self.publishers[topics.HIP_ENCODER].publish(self.encoder)
+        self._send(topics.HIP_ENCODER, self.encoder)
         if 'hip_angle' in measurement.counts:
             counts = Int64(data=int(measurement.counts['hip_angle']))
-            self.publishers[topics.HIP_COUNTS].publish(counts)
+            self._send(topics.HIP_COUNTS, counts)
         for leg, message in self.contacts.items():
             message.header.stamp = stamp
             message.wrench.force.z = float(measurement.contact.get(leg, 0.0))
-            self.publishers[topics.FOOT_CONTACT.format(leg=leg)].publish(message)
+            self._send(topics.FOOT_CONTACT.format(leg=leg), message)
         # Last, because controllers and the excitation answer this one.
         half = 0.5 * measurement.outputs['imu_angle']
         self.imu.header.stamp = stamp
         self.imu.orientation.y = math.sin(half)
         self.imu.orientation.w = math.cos(half)
         self.imu.angular_velocity.y = float(measurement.outputs['imu_rate'])
-        self.publishers[topics.IMU].publish(self.imu)
+        self._send(topics.IMU, self.imu)
 
     def _publish_joints(self, stamp: Any, positions: list[float]) -> None:
         self.joint_states.header.stamp = stamp
         self.joint_states.position = positions
-        self.publishers[topics.JOINT_STATES].publish(self.joint_states)
+        self._send(topics.JOINT_STATES, self.joint_states)
 
     def _publish_pendulum(self, stamp: Any, measurement: Any) -> None:
         self._publish_joints(stamp, [measurement.outputs['angle']])

@@ -50,6 +50,7 @@ from cg_hardware.simulation import (
 RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
 LATE = 0.02  # s behind the clock that are worth a warning
 REPEAT = 0.1  # s between repetitions of the first measurement of a lock-step run
+SILENCE = 2.0  # s after which another publisher of the machine's topics counts as dead
 WARNING_PERIOD = 1.0  # s between equal warnings
 
 
@@ -70,6 +71,8 @@ class SimulationNode(LifecycleNode):
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         self._next_diagnosis = 0.0
         self._faults = 0
+        self._eavesdropper = None
+        self._silent_ghosts = False
         if self.settings.autostart:
             self._start()
 
@@ -133,6 +136,7 @@ class SimulationNode(LifecycleNode):
         self.plant = self.make_plant()
         self.gate.drop('no command yet')
         self.progress.clear()
+        self._silent_ghosts = False
         self.phase = 'gathering'
         self._deadline = time.monotonic() + self.settings.peer_timeout
         return super().on_activate(state)
@@ -162,6 +166,7 @@ class SimulationNode(LifecycleNode):
 
     def _stop(self) -> None:
         self.phase = 'off'
+        self._stop_eavesdropping()
         if self.plant is not None:
             self.gate.drop('not active')
             self.plant.latch([0.0] * len(self.joints))
@@ -193,7 +198,7 @@ class SimulationNode(LifecycleNode):
         return 0.005
 
     def _missing_peers(self) -> str:
-        if self.count_publishers(topics.APPLIED_TORQUE) > 1:
+        if self._another_machine_speaks():
             return (
                 f'the end of another machine, which publishes {topics.APPLIED_TORQUE} in this '
                 'ROS domain'
@@ -207,6 +212,31 @@ class SimulationNode(LifecycleNode):
         if self.lockstep and self.command.get_publisher_count() == 0:
             return f'a publisher of {topics.TORQUE_COMMAND}'
         return ''
+
+    def _another_machine_speaks(self) -> bool:
+        # A machine that was killed stays on the graph for a while; it is known by its silence.
+        if self._silent_ghosts or self.count_publishers(topics.APPLIED_TORQUE) <= 1:
+            self._stop_eavesdropping()
+            return False
+        now = time.monotonic()
+        if self._eavesdropper is None:
+            self._heard_at = now
+            self._eavesdropper = self.create_subscription(
+                JointState, topics.APPLIED_TORQUE, self._on_foreign_torque, SENSOR_QOS
+            )
+        if now - self._heard_at < SILENCE:
+            return True
+        self._stop_eavesdropping()
+        self._silent_ghosts = True
+        return False
+
+    def _on_foreign_torque(self, message: JointState) -> None:
+        self._heard_at = time.monotonic()
+
+    def _stop_eavesdropping(self) -> None:
+        if self._eavesdropper is not None:
+            self.destroy_subscription(self._eavesdropper)
+            self._eavesdropper = None
 
     def _begin(self) -> None:
         self.phase = 'running'
