@@ -42,8 +42,11 @@ def run_all(
 def _local(workers: int | None) -> ProcessPoolExecutor:
     # One pool for the life of the process: starting it costs an import of CasADi per worker.
     # spawn, not fork: a forked child would inherit threads' locks (DDS, BLAS) in unknown states.
+    # One BLAS thread each: the matrices are small, and the workers fill the cores.
     global _pool
     if _pool is None:
+        for library in ('OPENBLAS', 'OMP', 'MKL'):
+            os.environ.setdefault(f'{library}_NUM_THREADS', '1')
         _pool = ProcessPoolExecutor(
             workers or os.cpu_count(), mp_context=multiprocessing.get_context('spawn')
         )
