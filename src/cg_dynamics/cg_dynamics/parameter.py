@@ -22,6 +22,8 @@ class Parameter:
         free: False for a parameter of shape that identification leaves alone unless told.
         scale: Typical size of a change worth noticing, in `unit`; steps and priors use it.
         logarithmic: True where the ratio of two values means more than their difference.
+        swept: True for a frequency or an instant, where the error has many local minima: a first
+            look keeps it at each of its starts.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Parameter:
     free: bool = True
     scale: float = 1.0
     logarithmic: bool = False
+    swept: bool = False
 
     @property
     def default(self) -> float:

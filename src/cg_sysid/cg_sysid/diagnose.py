@@ -21,7 +21,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
 from cg_sysid.evidence import block_gain, evidence, independent_samples
-from cg_sysid.identify import Fit, IdentificationError, fit, predict, score
+from cg_sysid.identify import Fit, IdentificationError, fit, predict, score, unknowns_of
 from cg_sysid.parallel import run_all
 from cg_sysid.record import Record
 from cg_sysid.trial import Trial, prepare
@@ -40,7 +40,8 @@ MOST_ROUNDS = 4
 SCREEN_ITERATIONS = 16
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
-MOST_STARTS = 8
+MOST_STARTS = 24
+FOLLOWED = 3  # starts of a swept parameter that are worth a second look
 
 Progress = Callable[[str, int, int], None]
 
@@ -304,17 +305,37 @@ def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     models = list(_starting_models(task))
     if len(models) == 1:
         return fit(models[0], train)
+    kept = _swept(models[0])
+    looks = _looks(models, train, kept)
+    if kept:
+        # Let go of the frequency only where a fit at its start is promising.
+        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [])
+    look, _ = looks[0]
+    return fit(models[0], train, start=look)
+
+
+def _swept(model: Model) -> list[str]:
+    # Of the effect that is being tried: those before it stay about where they were found.
+    own = model.effects[-1]
+    return [f'{own.label}.{p.name}' for p in own.parameters if p.swept]
+
+
+def _looks(
+    models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str]
+) -> list[tuple[Fit, Model]]:
+    """Short fits from each model and where they lead, best first; `kept` stay as they are."""
     looks = []
     for model in models:
+        only = [u.name for u in unknowns_of(model) if u.name not in kept] if kept else None
         try:
-            look = fit(model, train, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS)
-            looks.append((look, model))
+            look = fit(model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS)
+            found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
+            looks.append((look, model.with_values(found)))
         except IdentificationError as error:
             failure = error
     if not looks:
         raise failure
-    look, model = min(looks, key=lambda pair: pair[0].normalised_error)
-    return fit(model, train, start=look)
+    return sorted(looks, key=lambda pair: pair[0].normalised_error)
 
 
 def _starting_models(task: Task):
@@ -602,7 +623,11 @@ def _at_edge(o: Outcome) -> list[str]:
             continue
         low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
                          for x in (u.lower, u.upper, v))
-        if min(at - low, high - at) < 1e-3 * (high - low):
+        # Ranges suit machines of all sizes: a small value is not yet an edge.
+        margin = 1e-3 * (high - low)
+        if not u.logarithmic:
+            margin = min(margin, 0.1 * u.scale)
+        if min(at - low, high - at) < margin:
             found.append(f'{u.name} = {v:.3g} {u.unit} lies at the edge of its range')
     return found
 

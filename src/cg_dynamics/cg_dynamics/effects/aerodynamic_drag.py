@@ -2,14 +2,15 @@
 
 import casadi as ca
 
-from cg_dynamics.effects.effect import StanceEffect
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
 
-class AerodynamicDrag(StanceEffect):
-    """-coefficient w |w| on each leg, w its own rate in the world, where a joint rubs by w1 - w2."""
+class AerodynamicDrag(Effect):
+    """-coefficient w |w| on each leg, w its own rate in the world; a joint rubs by w1 - w2."""
 
     name = 'aerodynamic_drag'
+    place = 'environment'
     summary = (
         'Air resists each leg with the square of its own rate in the world: -coefficient w |w|.'
     )
@@ -19,6 +20,11 @@ class AerodynamicDrag(StanceEffect):
             neutral=0.0, starts=(0.02, 0.3), scale=0.02,
         ),
     )  # fmt: skip
+
+    @classmethod
+    def sites(cls, mechanism):
+        """The compass gait, whose coordinates are those rates; elsewhere quadratic friction."""
+        return ('all',) if mechanism.name == 'compass_gait' else ()
 
     def force(self, body, p):
         """Against the rate of each leg."""

@@ -22,7 +22,7 @@ class CoggingTorque(Effect):
         ),
         Parameter(
             'cycles', '1', 'per revolution of the joint', 1.0, 400.0,
-            starts=(10.0, 14.0, 20.0, 28.0, 38.0, 50.0, 7.0, 4.0), scale=0.2, logarithmic=True,
+            starts=(12.0, 4.0, 6.0, 8.0, 10.0, *range(15, 64, 3)), scale=0.2, swept=True,
         ),
         Parameter(
             'phase', 'rad', 'of the ripple at joint angle 0', -6.3, 6.3, starts=(0.0,), scale=0.1

@@ -28,8 +28,8 @@ class ExternalPush(StanceEffect):
             neutral=0.0, starts=(0.5,), scale=0.1,
         ),
         Parameter(
-            'instant', 's', 'time of the greatest force from the start of the record', 0.0, 3600.0,
-            starts=(0.5, 1.5, 2.5, 3.5, 5.0, 7.0, 10.0, 15.0), scale=0.05,
+            'instant', 's', 'time of the greatest force from the start of the record', 0.0, 600.0,
+            starts=(0.5, 1.5, 2.5, 3.5, 5.0, 7.0, 10.0, 15.0), scale=0.05, swept=True,
         ),
         Parameter(
             'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,

@@ -14,7 +14,7 @@ class FootCompliance(StanceEffect):
     )
     parameters = (
         Parameter(
-            'stiffness', 'N m/rad', 'of the pad against leaning', 0.0, 5e3,
+            'stiffness', 'N m/rad', 'of the pad against leaning', 0.0, 500.0,
             neutral=0.0, starts=(1.0, 20.0), scale=0.5,
         ),
     )  # fmt: skip

@@ -13,7 +13,7 @@ class SpringDamping(SpringEffect):
     summary = 'The springs of the set-up resist being stretched and released: coefficient ds/dt.'
     parameters = (
         Parameter(
-            'coefficient', 'N s/m', 'force per rate of stretch, of each spring', 0.0, 500.0,
+            'coefficient', 'N s/m', 'force per rate of stretch, of each spring', 0.0, 100.0,
             neutral=0.0, starts=(0.1, 2.0), scale=0.1,
         ),
     )  # fmt: skip
