@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from cg_sysid import parallel
 from cg_sysid.bags import parse_note
 from cg_sysid.report.wording import left_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
@@ -80,6 +81,7 @@ def run(program: str, work: Callable[[argparse.Namespace], int], options) -> int
         print(f'{program}: error: {one_line(error)}', file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
+        parallel.stop()
         print(f'{program}: interrupted', file=sys.stderr)
         return INTERRUPTED
 

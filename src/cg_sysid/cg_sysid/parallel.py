@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from typing import Any
@@ -48,6 +49,25 @@ def _local(workers: int | None) -> ProcessPoolExecutor:
         for library in ('OPENBLAS', 'OMP', 'MKL'):
             os.environ.setdefault(f'{library}_NUM_THREADS', '1')
         _pool = ProcessPoolExecutor(
-            workers or os.cpu_count(), mp_context=multiprocessing.get_context('spawn')
+            workers or os.cpu_count(),
+            mp_context=multiprocessing.get_context('spawn'),
+            initializer=_ignore_interrupts,
         )
     return _pool
+
+
+def _ignore_interrupts() -> None:
+    # Ctrl-C reaches every process of the terminal; the one that was started answers for all.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def stop() -> None:
+    """Drop the work that is queued and end the local processes, in the middle of whatever."""
+    global _pool
+    if _pool is None:
+        return
+    pool, _pool = _pool, None
+    processes = list((pool._processes or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()

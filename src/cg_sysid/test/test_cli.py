@@ -2,12 +2,13 @@
 
 import json
 import shutil
+import time
 
 import pytest
 import yaml
 
 from cg_dynamics.model import Model
-from cg_sysid import diagnose_cli, identify_cli, report_cli
+from cg_sysid import cli, diagnose_cli, identify_cli, parallel, report_cli
 from cg_sysid.bags import read_bag, write_bag
 
 EFFECTS = 'torque_bias,quadratic_friction'
@@ -245,3 +246,22 @@ def test_a_bag_of_another_machine_is_refused(places, capsys):
 def test_a_report_of_nothing_is_refused(places, capsys, name, error):
     assert report_cli.main([str(places['tmp'] / name)]) == 2
     assert capsys.readouterr().err == f'report: error: {error.format(**places)}\n'
+
+
+def test_an_interrupt_ends_with_one_line(capsys):
+    def work(_):
+        raise KeyboardInterrupt
+
+    assert cli.run('diagnose', work, None) == cli.INTERRUPTED
+    assert capsys.readouterr().err == 'diagnose: interrupted\n'
+
+
+def test_a_queue_of_work_can_be_dropped():
+    parallel.stop()
+    pool = parallel._local(1)
+    waiting = [pool.submit(time.sleep, 30) for _ in range(3)]
+    begun = time.monotonic()
+    parallel.stop()
+    pool.shutdown(wait=True)
+    assert time.monotonic() - begun < 10
+    assert waiting[-1].cancelled() or waiting[-1].exception() is not None

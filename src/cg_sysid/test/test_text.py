@@ -10,7 +10,8 @@ from cg_sysid.text import effect_name, listed, measured, number, plain_unit
 @pytest.mark.parametrize(
     ('value', 'text'),
     [
-        (None, '\u2013'), (math.nan, '\u2013'), (0.0, '0'), (1.0, '1.00'), (-0.1234, '\u22120.123'),
+        (None, '\u2013'), (math.nan, '\u2013'), (0.0, '0'), (1.0, '1.00'),
+        (-0.1234, '\u22120.123'),
         (248123.0, '248\u202f000'), (1.5e9, '1.50e9'), (2e-7, '2.00e\u22127'),
     ],
 )  # fmt: skip

@@ -39,7 +39,7 @@ def viewer(facts: Facts, drawn: Facts) -> Markup | None:
         groups.setdefault(words, []).append(tag('option', text, value=k, selected=k == 0))
     spans = [('whole', 0), ('5 s', 5), ('1 s', 1), ('0.2 s', 0.2)]
     thinned = drawn['thinned']
-    note = f' Every {thinned}th sample is shown.' if thinned > 1 else ''
+    note = f' One sample in {thinned} is shown.' if thinned > 1 else ''
     missing = len(facts['records']) - len(drawn['records'])
     note += f' {missing} more records are not shown.' if missing > 0 else ''
     return tag('section',

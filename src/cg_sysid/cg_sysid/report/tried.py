@@ -64,7 +64,7 @@ def _candidate(c: Facts, taken: str | None, rivals: set[str], strongest: float) 
     if c['label'] == taken:
         kind, outcome = 'taken', tag('span', 'taken', class_='pill taken')
     elif c['label'] in rivals:
-        kind, outcome = 'rival-row', tag('span', 'explains it as well', class_='pill rival')
+        kind, outcome = 'rival-row', tag('span', 'explains it as well', class_='pill warning')
     elif c['reason']:
         parts = [tag('div', part) for part in c['reason'].split('; ')]
         kind, outcome = 'rejected', tag('div', parts, class_='small')
