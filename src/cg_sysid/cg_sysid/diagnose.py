@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -306,10 +307,12 @@ def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     if len(models) == 1:
         return fit(models[0], train)
     kept = _swept(models[0])
-    looks = _looks(models, train, kept)
+    # A few seconds do not show an instant that is still to come.
+    horizon = np.inf if kept and TIME in models[0].effects[-1].extra_inputs else SCREEN_S
+    looks = _looks(models, train, kept, horizon)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
-        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [])
+        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [], horizon)
     look, _ = looks[0]
     return fit(models[0], train, start=look)
 
@@ -321,14 +324,14 @@ def _swept(model: Model) -> list[str]:
 
 
 def _looks(
-    models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str]
+    models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str], horizon: float
 ) -> list[tuple[Fit, Model]]:
     """Short fits from each model and where they lead, best first; `kept` stay as they are."""
     looks = []
     for model in models:
         only = [u.name for u in unknowns_of(model) if u.name not in kept] if kept else None
         try:
-            look = fit(model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS)
+            look = fit(model, train, only, horizon=horizon, iterations=SCREEN_ITERATIONS)
             found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
             looks.append((look, model.with_values(found)))
         except IdentificationError as error:

@@ -349,6 +349,7 @@ def _minimise(
     weight: float,
     iterations: int,
     drift: float,
+    leading: bool = False,
 ) -> tuple[np.ndarray, list[np.ndarray], _Point | None, bool]:
     lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
                       for u in problem.unknowns])
@@ -360,6 +361,8 @@ def _minimise(
     for _ in range(iterations):
         _, gradient, _ = _reduce(point, 0.0)
         frozen = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+        if leading:
+            frozen |= _unseen(problem, theta, point, weight)
         step, moves = _step(point, damping, frozen)
         trial_theta = np.clip(theta + step, lower, upper)
         trial_motions = [m + d for m, d in zip(motions, moves, strict=True)]
@@ -377,6 +380,15 @@ def _minimise(
             if damping > 1e8:
                 return theta, motions, point, True
     return theta, motions, point, False
+
+
+def _unseen(
+    problem: _Problem, theta: np.ndarray, point: _Point, weight: float
+) -> np.ndarray:
+    """Unknowns whose typical change these few seconds do not notice at all, such as a late push."""
+    values = problem.values(theta)
+    scales = np.array([u.scale for u in problem.unknowns]) / problem.chain(values)
+    return np.diag(point.shared_hessian) * scales**2 < weight
 
 
 def fit(
@@ -417,7 +429,7 @@ def fit(
     stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
     for horizon in stages:
         # The short horizons only lead the way; the belief of the file keeps them sober.
-        found = _minimise(problem, theta, motions, horizon, weight, 12, 3e-2)
+        found = _minimise(problem, theta, motions, horizon, weight, 12, 3e-2, True)
         if found[2] is not None:
             theta, motions = found[0], found[1]
             weight = _weight(found[2]) if reweight else 1.0

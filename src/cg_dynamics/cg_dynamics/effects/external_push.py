@@ -29,7 +29,7 @@ class ExternalPush(StanceEffect):
         ),
         Parameter(
             'instant', 's', 'time of the greatest force from the start of the record', 0.0, 600.0,
-            starts=(0.5, 1.5, 2.5, 3.5, 5.0, 7.0, 10.0, 15.0), scale=0.05, swept=True,
+            starts=tuple(0.5 + second for second in range(20)), scale=0.05, swept=True,
         ),
         Parameter(
             'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,
