@@ -385,7 +385,7 @@ def _minimise(
 def _unseen(
     problem: _Problem, theta: np.ndarray, point: _Point, weight: float
 ) -> np.ndarray:
-    """Unknowns whose typical change these few seconds do not notice at all, such as a late push."""
+    """Unknowns whose typical change these few seconds do not notice, such as a late push."""
     values = problem.values(theta)
     scales = np.array([u.scale for u in problem.unknowns]) / problem.chain(values)
     return np.diag(point.shared_hessian) * scales**2 < weight

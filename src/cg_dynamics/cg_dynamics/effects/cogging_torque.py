@@ -25,7 +25,7 @@ class CoggingTorque(Effect):
             starts=(12.0, 4.0, 6.0, 8.0, 10.0, *range(15, 64, 3)), scale=0.2, swept=True,
         ),
         Parameter(
-            'phase', 'rad', 'of the ripple at joint angle 0', -6.3, 6.3, starts=(0.0,), scale=0.1
+            'phase', 'rad', 'of the ripple at joint angle 0', -9.5, 9.5, starts=(0.0,), scale=0.1
         ),
     )  # fmt: skip
 

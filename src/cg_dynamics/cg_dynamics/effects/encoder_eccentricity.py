@@ -21,7 +21,7 @@ class EncoderEccentricity(SensorEffect):
             neutral=0.0, starts=(0.005,), scale=0.001,
         ),
         Parameter(
-            'phase', 'rad', 'of the error at angle 0', -6.3, 6.3, starts=(0.0, 1.5), scale=0.1
+            'phase', 'rad', 'of the error at angle 0', -9.5, 9.5, starts=(0.0, 1.5), scale=0.1
         ),
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ class PositionDependentFriction(Effect):
             neutral=0.0, starts=(0.05, 1.0), scale=0.05,
         ),
         Parameter(
-            'tightest', 'rad', 'joint angle of most friction', -6.3, 6.3,
+            'tightest', 'rad', 'joint angle of most friction', -9.5, 9.5,
             starts=(1.5, -1.5, 0.0), scale=0.1,
         ),
         TRANSITION_RATE,
