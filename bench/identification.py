@@ -146,7 +146,7 @@ def ours(problem, model, start, trials):
     """Our fit: set out from `start`, believing what the nominal file believes."""
     began = time.process_time()
     at = {name: start.values[name] for name in problem.names}
-    found = fit(model, trials, reweight=False, at=at)
+    found = fit(model, trials, at=at)
     spent = time.process_time() - began
     cost = problem.cost(problem.pack(found.values, list(found.motions)))
     return spent, cost, found.values, found.evaluations

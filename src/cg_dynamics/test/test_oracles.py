@@ -4,9 +4,7 @@ The hip body bisects the legs, which neither engine can express as a plain joint
 good as massless, and test_compass_gait.py checks its terms against the seed text.
 """
 
-import importlib.util
-import sys
-from pathlib import Path
+import importlib
 
 import numpy as np
 import pytest
@@ -29,14 +27,7 @@ def links(bare):
 @pytest.fixture(scope='module')
 def engine():
     pytest.importorskip('mujoco', reason='MuJoCo is not installed')
-    path = Path(__file__).parents[2] / 'cg_sysid' / 'test' / 'mujoco_robot.py'
-    if not path.exists():
-        pytest.skip(f'{path.name} comes with the sources of cg_sysid, which are not here')
-    spec = importlib.util.spec_from_file_location('mujoco_robot', path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules['mujoco_robot'] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module('mujoco_robot')
 
 
 @pytest.fixture

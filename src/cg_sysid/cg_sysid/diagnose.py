@@ -36,7 +36,7 @@ FIDELITY = 2e-3
 EARNED = 10.0  # nats an effect must gain over the model without it
 MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
 AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
-SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall
+SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 MOST_ROUNDS = 4
 SCREEN_ITERATIONS = 16
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
@@ -77,7 +77,7 @@ class Candidate:
         held: Score on the held-out records.
         evidence: In nats against the base model: positive speaks for the effect.
         held_gain: Fall of the held-out squared error, relative.
-        significance: The same in standard errors over blocks.
+        significance: The same in standard errors, by the ranks of blocks of time.
         explained: RMS error explained on held-out records, in noise standard deviations, of the
             output where it is largest.
         parameters: Own parameters: name -> (value, standard deviation, unit).
@@ -477,7 +477,7 @@ class _Search:
 
     def _judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
         n = len(self.train)  # residuals: training trials first, then those held out
-        drop, error = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
+        significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
         before = _per_output(base.held)
         after = _per_output(o.held)
         explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
@@ -485,7 +485,7 @@ class _Search:
         reasons = []
         if gained < EARNED:
             reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
-        if not drop > SIGNIFICANT * error:
+        if significance < SIGNIFICANT or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
         if explained < MATERIAL:
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
@@ -498,7 +498,7 @@ class _Search:
             held=o.held,
             evidence=float(gained),
             held_gain=float(held_gain),
-            significance=float(drop / error) if error > 0 else 0.0,
+            significance=significance,
             explained=explained,
             parameters=_own_parameters(o),
             reason='; '.join(reasons),

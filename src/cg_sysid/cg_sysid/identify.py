@@ -29,6 +29,7 @@ RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
+SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
 
@@ -261,7 +262,7 @@ def _evaluate(
     for i, trial in enumerate(problem.trials):
         n, normal, _, _ = _simulate_sensitive(problem, i, values, motions[i], horizon)
         m2 = len(motions[i])
-        if normal.rows < n or not np.isfinite(normal.sse).all():
+        if normal.rows < n or not np.isfinite(normal.hessian).all():
             return None
         h, g = normal.hessian * weight, normal.gradient * weight
         h[m2:] *= chain[:, None]
@@ -371,7 +372,7 @@ def _minimise(
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
             damping = max(damping / 10, 1e-9)
-            if gain < drift * (1 + candidate.cost):
+            if gain < max(drift * candidate.cost, SMALL_GAIN):
                 return theta, motions, point, True
         else:
             if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:

@@ -45,7 +45,7 @@ def nominal_and_truth(seed):
     rng = np.random.default_rng(seed)
     truth = dict(nominal.values)
     for name in ('c1', 'c2', 'c4', 'c5'):
-        truth[name] *= 1 + rng.choice([-1, 1]) * rng.uniform(0.1, 0.15)
+        truth[name] *= float(1 + rng.choice([-1, 1]) * rng.uniform(0.1, 0.15))
     return nominal, truth
 
 
