@@ -57,7 +57,8 @@ def records_of(machine, seed, spring_error=0.0):
 
 def with_small_faults(machine):
     faulty = machine
-    for name, values in (('actuator_delay', {'delay': 0.001}), ('encoder_offset', {'offset': 3e-4})):
+    faults = {'actuator_delay': {'delay': 0.001}, 'encoder_offset': {'offset': 3e-4}}
+    for name, values in faults.items():
         if all(name != e.label for e in faulty.effects):
             faulty = faulty.with_effect(name, None, **values)
     key = 'coulomb_friction.transition_rate'
@@ -84,7 +85,10 @@ def case(effect, seed, faults):
             expected = same
     inside = [
         abs(c.parameters[n][0] - v) < 1.96 * c.parameters[n][1] + 2e-3 * abs(v)
-        for c in found.causes if c.label == effect for n, v in values.items() if n in c.parameters
+        for c in found.causes
+        if c.label == effect
+        for n, v in values.items()
+        if n in c.parameters
     ]
     return {
         'exact': named == expected,
@@ -109,8 +113,8 @@ def main():
     nominal = Model.load(model_path(NOMINAL_MODEL))
     effects = options.effects.split(',') if options.effects else hideable_effects(nominal)
     lines = [
-        '| hidden | cases | named exactly | found | chi2/N before | after | inside 95 % interval | '
-        'also or instead | s each |',
+        '| hidden | cases | named exactly | found | chi2/N before | after '
+        '| inside 95 % interval | also or instead | s each |',
         '|---|---:|---:|---:|---:|---:|---:|---|---:|',
     ]
     total = {'exact': 0, 'found': 0, 'cases': 0}

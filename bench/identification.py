@@ -62,6 +62,7 @@ class Problem:
         self.calls = 0
 
     def pack(self, values, motions=None):
+        """All unknowns in one vector."""
         return np.concatenate([values, *(motions or [trial.motion for trial in self.trials])])
 
     def residuals(self, z, integrate=None):
@@ -90,6 +91,7 @@ class Problem:
         return np.concatenate([*parts, belief])
 
     def cost(self, z, integrate=None):
+        """Sum of squared residuals."""
         r = self.residuals(z, integrate)
         return FAR if r is None else float(r @ r)
 

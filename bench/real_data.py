@@ -135,7 +135,8 @@ def run(study, data, bags, workers):
             for name, (value, sigma, unit) in cause.parameters.items()
         )
         lines.append(
-            f'| {cause.label} | {numbers} | {cause.evidence:.0f} | {", ".join(cause.rivals) or "-"} |'
+            f'| {cause.label} | {numbers} | {cause.evidence:.0f} '
+            f'| {", ".join(cause.rivals) or "-"} |'
         )
     lines += ['', f'{time.monotonic() - began:.0f} s.', '']
     return '\n'.join(lines)

@@ -6,7 +6,7 @@ from cg_description.model_file import ModelFileError
 
 
 def models_directory() -> Path:
-    """The directory of the model files: beside the sources, or in the installed share directory."""
+    """The directory of the model files: beside the sources, or in the share directory."""
     package = Path(__file__).resolve().parent
     candidates = [package.parent / 'models']
     # colcon installs to <prefix>/lib/pythonX.Y/site-packages/cg_description and pip the same way;

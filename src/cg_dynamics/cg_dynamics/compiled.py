@@ -16,6 +16,7 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -106,7 +107,7 @@ class CompiledModel:
         if library is None:
             from cg_dynamics.fallback import InterpretedRollout
 
-            self._c = InterpretedRollout(equations, free)
+            self._c: Any = InterpretedRollout(equations, free)
         else:
             self._c = _bind(library)
 
@@ -275,7 +276,9 @@ class CompiledModel:
         )
 
 
-def compile_model(model: Model, setup: Setup, free: tuple[str, ...] | None = None) -> CompiledModel:
+def compile_model(
+    model: Model, setup: Setup, free: tuple[str, ...] | None = None
+) -> CompiledModel:
     """The compiled form of a model's structure in a set-up; quick when it was built before.
 
     Args:

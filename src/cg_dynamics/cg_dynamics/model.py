@@ -16,7 +16,6 @@ from cg_description.model_file import (
     sha256,
     write_atomically,
 )
-
 from cg_dynamics.effects import Effect, make_effect
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import Mechanism, mechanism
@@ -69,7 +68,7 @@ class Model:
         try:
             body = mechanism(file.mechanism)
             quantities = _match(body.parameters, file.parameters, 'parameters')
-            effects = []
+            effects: list[Effect] = []
             for entry in file.effects:
                 effect = make_effect(entry.name, body, entry.at)
                 if any(effect.label == other.label for other in effects):
@@ -108,7 +107,10 @@ class Model:
                 EffectEntry(
                     effect.name,
                     effect.at,
-                    {p.name: self.quantities[f'{effect.label}.{p.name}'] for p in effect.parameters},
+                    {
+                        p.name: self.quantities[f'{effect.label}.{p.name}']
+                        for p in effect.parameters
+                    },
                 )
                 for effect in self.effects
             ),

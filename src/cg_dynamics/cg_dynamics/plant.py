@@ -6,6 +6,7 @@ sensors report: noisy, late, in counts.
 """
 
 import bisect
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,7 +121,7 @@ class Plant:
         times = [t + self._input_delay for t, _ in self._latches]
         first = bisect.bisect_right(times, start + 1e-12) - 1
         edges = [start, *(t for t in times[first + 1 :] if t < end - 1e-12), end]
-        for index, (begin, stop) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        for index, (begin, stop) in enumerate(itertools.pairwise(edges)):
             u = stamped(self._latches[first + index][1], self._compiled.input_names, start)
             steps = max(1, int(np.ceil((stop - begin) / self._fine - 1e-9)))
             self._compiled.advance(self._x, u, self._p, (stop - begin) / steps, steps)
@@ -181,7 +182,9 @@ class Plant:
         d0, d1 = (np.asarray(self._compiled.f(x, u, self._p)).ravel() for x in (x0, x1))
         r = 1 - s
         return (
-            (1 + 2 * s) * r**2 * x0 + (1 + 2 * r) * s**2 * x1 + h * s * r**2 * d0 - h * r * s**2 * d1
+            (1 + 2 * s) * r**2 * x0
+            + (1 + 2 * r) * s**2 * x1
+            + h * s * r * (r * d0 - s * d1)
         )
 
     def _contact(self) -> dict[str, float]:

@@ -15,12 +15,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.identify import Fit, IdentificationError, fit, predict, score, unknowns_of
 from cg_sysid.parallel import run_all

@@ -91,9 +91,10 @@ def block_gain(
     for a, b in zip(before, after, strict=True):
         blocks = max(1, len(a) // rows)
         for x, y in zip(np.array_split(a, blocks), np.array_split(b, blocks), strict=True):
-            # One output may be all that an effect changes.
-            drops.append(np.nanmean(x**2, axis=0) - np.nanmean(y**2, axis=0))
-    change = np.nansum(np.array(drops), axis=1)
+            seen = np.maximum(np.isfinite(x).sum(axis=0), 1)
+            # Summed over outputs: one of them may be all that an effect changes.
+            drops.append((np.nansum(x**2 - y**2, axis=0) / seen).sum())
+    change = np.array(drops)
     change = change[np.abs(change) > TIE]
     if len(change) < MIN_BLOCKS:
         return 0.0

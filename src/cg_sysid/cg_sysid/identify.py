@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
+
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, Normal, compile_model
 from cg_dynamics.model import Model
-
 from cg_sysid.trial import Trial
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
@@ -115,7 +115,8 @@ class Fit:
     def sigmas(self) -> np.ndarray:
         """Standard deviation of each value, in its unit, shape (k,)."""
         spread = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
-        factor = [v if u.logarithmic else 1.0 for u, v in zip(self.unknowns, self.values)]
+        pairs = zip(self.unknowns, self.values, strict=True)
+        factor = [v if u.logarithmic else 1.0 for u, v in pairs]
         return spread * np.array(factor)
 
     @property
@@ -448,6 +449,7 @@ def fit(
         if converged and abs(np.log(new / weight)) < 0.1:
             break
         weight = new
+    assert point is not None
     values = problem.values(theta)
     covariance, information = _uncertainty(problem, theta, motions, longest, weight)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
@@ -536,6 +538,8 @@ def _block_scores(
     blocks = []
     for i, trial in enumerate(problem.trials):
         n, _, y, jacobian = _simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
+        assert y is not None
+        assert jacobian is not None
         residual = np.nan_to_num((y - trial.outputs[:n]) / trial.sigma**2) * weight
         rows = np.einsum('kj,kjc->kc', residual, jacobian)
         edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))

@@ -7,10 +7,10 @@ in between are left out. For tests, benches, and for asking what an experiment w
 from collections.abc import Callable, Sequence
 
 import numpy as np
+
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
-
 from cg_sysid.record import Record
 
 Signal = Callable[[float], float]

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-
 from cg_sysid.noise import measure_noise
 from cg_sysid.record import Record
 

@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip('mujoco', reason='MuJoCo is not installed')
 
+from mujoco_robot import Hidden, simulate_mujoco, two_links
+
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from mujoco_robot import Hidden, simulate_mujoco, two_links
-
 from cg_sysid.diagnose import Options, diagnose
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.record import Record

@@ -44,8 +44,8 @@ class CompassGait(Mechanism):
         Parameter('leg_length', 'm', 'foot to hip', 0.05, 5.0, free=False),
         Parameter('total_mass', 'kg', 'whole robot', 0.05, 500.0, free=False),
         Parameter('gravity', 'm/s^2', 'acceleration of gravity', 0.0, 30.0, free=False),
-        Parameter('c1', '1', 'inertia of the inner legs about the hip, plus c3', 1e-5, 2, scale=0.02),
-        Parameter('c2', '1', 'inertia of the outer legs about the hip, plus c3', 1e-5, 2, scale=0.02),
+        Parameter('c1', '1', 'inner legs about the hip, plus c3', 1e-5, 2, scale=0.02),
+        Parameter('c2', '1', 'outer legs about the hip, plus c3', 1e-5, 2, scale=0.02),
         Parameter('c3', '1', 'inertia of the hip body, a quarter', 1e-7, 1.0, scale=1e-4),
         Parameter('c4', '1', 'first moment of the inner legs', -1.0, 1.0, scale=0.02),
         Parameter('c5', '1', 'first moment of the outer legs', -1.0, 1.0, scale=0.02),
@@ -101,7 +101,7 @@ class CompassGait(Mechanism):
             return Kinematics(('q_both',), ca.DM([1, 1]))
         return super().kinematics(setup)
 
-    def consistency(self, p: Symbols):
+    def consistency(self, p):
         """Positive masses and inertias exist: theory.md, (LUMPS)."""
         c1, c2, c3, c4, c5, c6 = (p[f'c{i}'] for i in range(1, 7))
         # Multiplied out by nothing: each denominator is itself required to be positive.

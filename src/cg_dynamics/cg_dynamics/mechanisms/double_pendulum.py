@@ -23,10 +23,13 @@ class DoublePendulum(Mechanism):
     inputs = ('shoulder_torque', 'elbow_torque')
     outputs = ('shoulder_angle', 'elbow_angle')
     output_units = ('rad', 'rad')
-    sensor_kinds = {'shoulder_angle': 'encoder', 'elbow_angle': 'encoder'}  # noqa: RUF012 - read only
+    sensor_kinds = {  # noqa: RUF012 - read only
+        'shoulder_angle': 'encoder',
+        'elbow_angle': 'encoder',
+    }
     bodies = ('upper', 'lower')
     parameters = (
-        Parameter('upper_inertia', 'kg m^2', 'I1 + m2 l1^2, about the shoulder', 1e-6, 1e2, scale=5e-3),
+        Parameter('upper_inertia', 'kg m^2', 'I1 + m2 l1^2', 1e-6, 1e2, scale=5e-3),
         Parameter('lower_inertia', 'kg m^2', 'I2, about the elbow', 1e-6, 1e2, scale=5e-3),
         Parameter('coupling', 'kg m^2', 'm2 r2 l1', -1e2, 1e2, scale=5e-3),
         Parameter('upper_gravity', 'N m', '(m1 r1 + m2 l1) g', -1e3, 1e3, scale=0.3),
@@ -58,7 +61,7 @@ class DoublePendulum(Mechanism):
         """The two joint encoders."""
         return {'shoulder_angle': q[0], 'elbow_angle': q[1]}
 
-    def consistency(self, p: Symbols):
+    def consistency(self, p):
         """Positive inertias, and a mass matrix that is positive definite at every elbow angle."""
         a1, a2, a3 = p['upper_inertia'], p['lower_inertia'], p['coupling']
         return [a1, a2, a1 * a2 - a3**2]

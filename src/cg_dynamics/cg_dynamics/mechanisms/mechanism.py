@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
@@ -86,6 +87,6 @@ class Mechanism(ABC):
         """Free coordinates in this set-up; all of them unless a mechanism knows fixtures."""
         return Kinematics(self.coordinates, ca.DM.eye(len(self.coordinates)))
 
-    def consistency(self, p: Symbols) -> list[ca.SX]:
+    def consistency(self, p: Mapping[str, Any]) -> list[Any]:
         """Expressions that are positive if and only if real bodies have these parameters."""
         return []

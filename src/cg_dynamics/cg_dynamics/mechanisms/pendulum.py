@@ -39,6 +39,6 @@ class Pendulum(Mechanism):
         """The joint encoder."""
         return {'angle': q[0]}
 
-    def consistency(self, p: Symbols):
+    def consistency(self, p):
         """Positive inertia."""
         return [p['inertia']]
