@@ -40,6 +40,8 @@ SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, bloc
 MOST_ROUNDS = 4
 SCREEN_ITERATIONS = 16
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
+FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
+SHORTEST_BLOCK_S = 0.1
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
 MOST_STARTS = 24
 FOLLOWED = 3  # starts of a swept parameter that are worth a second look
@@ -394,7 +396,9 @@ class _Search:
         self.rounds: list[Round] = []
         trials = (*train, *held)
         self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
-        self.rows_per_block = max(1, int(BLOCK_S / np.median(self.steps)))
+        judged = sum(trial.duration for trial in held)
+        block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
+        self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
     def run(self) -> Diagnosis:
         base = self._fit([Task(self.nominal)], 'nominal model')[0]
