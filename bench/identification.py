@@ -25,9 +25,10 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.identify import fit, unknowns_of
+from cg_sysid.identify import fit
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
+from cg_sysid.unknowns import unknowns_of
 
 SETUPS = (
     'spring_stabilised_inner',

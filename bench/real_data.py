@@ -20,8 +20,10 @@ import numpy as np
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.bags import read_bag
+from cg_sysid.candidates import believing
 from cg_sysid.check import check_recording
-from cg_sysid.diagnose import Options, believing, diagnose
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
 from cg_sysid.identify import fit, predict, score
 from cg_sysid.importing import import_to_bags
 from cg_sysid.trial import prepare

@@ -15,7 +15,8 @@ from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.bags import read_bag
-from cg_sysid.diagnose import Options, diagnose
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.rehearse import rehearse
 

@@ -18,7 +18,8 @@ from rich.console import Console
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
-from cg_sysid.diagnose import Diagnosis, Options, diagnose
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Diagnosis, Options
 from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
 from cg_sysid.faults import FaultSignal
 from cg_sysid.intake import Intake, take_in

@@ -16,12 +16,13 @@ from cg_description.model_file import write_atomically
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.curves import Curve
-from cg_sysid.diagnose import Candidate, Cause, Diagnosis, Round
+from cg_sysid.diagnosis import Candidate, Cause, Diagnosis, Round
 from cg_sysid.findings import Finding
-from cg_sysid.identify import Fit, Unknown
+from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
 from cg_sysid.leftover import leftover
 from cg_sysid.trial import Trial
+from cg_sysid.unknowns import Unknown
 
 DIAGNOSIS = 'cg_diagnosis/1'
 IDENTIFICATION = 'cg_identification/1'

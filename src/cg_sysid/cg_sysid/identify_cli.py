@@ -19,13 +19,14 @@ from cg_dynamics.model import Model
 from cg_sysid import cli, curves
 from cg_sysid.diagnosis_file import Facts, identification_facts, write_facts
 from cg_sysid.errors import RecordingError
-from cg_sysid.identify import Fit, IdentificationError, fit, predict, score
+from cg_sysid.identify import Fit, fit, predict, score
 from cg_sysid.intake import Intake, take_in
 from cg_sysid.nelder_mead import nelder_mead
 from cg_sysid.provenance import provenance
 from cg_sysid.report import write_report
 from cg_sysid.text import measured, number, plain_unit
 from cg_sysid.trial import Trial, prepare
+from cg_sysid.unknowns import IdentificationError
 
 METHODS: dict[str, Callable[..., Fit]] = {'gauss_newton': fit, 'nelder_mead': nelder_mead}
 

@@ -16,8 +16,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from cg_dynamics.model import Model
-from cg_sysid.identify import Fit, IdentificationError, _Problem, score, unknowns_of
+from cg_sysid.identify import Fit, score
+from cg_sysid.simulation_error import Problem
 from cg_sysid.trial import Trial
+from cg_sysid.unknowns import IdentificationError, unknowns_of
 
 EVALUATIONS_PER_UNKNOWN = 200  # the limit of fminsearch
 TOLERANCE = 1e-4  # of fminsearch: on the simplex, relative to each start, and on the cost
@@ -53,7 +55,7 @@ def nelder_mead(
     if not unknowns:
         raise IdentificationError(f'model {model.name!r} has no free parameter to identify')
     began = clock.perf_counter()
-    cost = _Cost(_Problem(model, trials, unknowns), _motions(model, trials))
+    cost = _Cost(Problem(model, trials, unknowns), _motions(model, trials))
     values = np.array([u.prior for u in unknowns])
     if cost(values) >= RUNAWAY:
         raise IdentificationError(
@@ -134,7 +136,7 @@ def _unscaled(found: OptimizeResult, scale: np.ndarray) -> OptimizeResult:
 class _Cost:
     """Eq. 4.13 over all records, each output in units of its noise."""
 
-    def __init__(self, problem: _Problem, motions: list[np.ndarray]):
+    def __init__(self, problem: Problem, motions: list[np.ndarray]):
         self.problem, self.motions = problem, motions
 
     def __call__(self, values: np.ndarray) -> float:

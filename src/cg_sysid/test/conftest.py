@@ -8,8 +8,9 @@ from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.bags import write_bag
-from cg_sysid.diagnose import Options, diagnose
+from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnose_cli import diagnosis_curves
+from cg_sysid.diagnosis import Options
 from cg_sysid.diagnosis_file import diagnosis_facts
 from cg_sysid.intake import take_in
 from cg_sysid.provenance import provenance

@@ -14,7 +14,8 @@ from mujoco_robot import Hidden, simulate_mujoco, two_links
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnose import Options, diagnose
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.record import Record
 

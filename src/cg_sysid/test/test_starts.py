@@ -6,7 +6,7 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.diagnose import Task, try_candidate
+from cg_sysid.candidates import Task, try_candidate
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 

@@ -5,7 +5,7 @@ import numpy as np
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnose import candidates_for
+from cg_sysid.candidates import candidates_for
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 

@@ -1,0 +1,199 @@
+"""One effect on top of a model: where it can act, where its fit sets out, and how well it does."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import TIME
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
+from cg_sysid.trial import Trial
+from cg_sysid.unknowns import IdentificationError
+
+SCREEN_ITERATIONS = 16
+SCREEN_S = 2.0  # length of the first look at each start of a candidate
+MOST_STARTS = 24
+FOLLOWED = 3  # starts of a swept parameter that are worth a second look
+
+
+@dataclass(frozen=True)
+class Task:
+    """One candidate to fit: an effect (or None for the base alone) on top of a model."""
+
+    model: Model
+    effect: tuple[str, str | None] | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What fitting a task gave: fits on both sets and the residuals over noise."""
+
+    task: Task
+    label: str
+    model: Model
+    train: Fit
+    held: Fit
+    residuals: tuple[np.ndarray, ...] = field(repr=False)
+    belief: float
+    unknowns: int
+
+
+def candidates_for(
+    model: Model, setups: Sequence[Setup], names: Sequence[str] | None = None
+) -> list[tuple[str, str | None]]:
+    """(effect, at) of all that could show in these set-ups and that the model does not have."""
+    present = {effect.label for effect in model.effects}
+    found = []
+    for name, effect in LIBRARY.items():
+        if not effect.applies(setups):
+            continue
+        for at in effect.sites(model.mechanism):
+            made = effect(model.mechanism, at)
+            wanted = names is None or name in names or made.label in names
+            if wanted and made.label not in present:
+                found.append((name, made.at))
+    if names is not None and not found:
+        raise IdentificationError(
+            f'none of the effects {", ".join(names)} can be tried; the library has: '
+            f'{", ".join(LIBRARY)}'
+        )
+    return found
+
+
+def starts_of(name: str) -> list[dict[str, float]]:
+    """Values of an effect's parameters from which its identification sets out."""
+    grids = [
+        [(p.name, start) for start in p.starts] if p.free else [(p.name, p.default)]
+        for p in LIBRARY[name].parameters
+    ]
+    return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
+
+
+def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
+    """Fit one candidate on the training trials and score it on the held-out ones.
+
+    Returns:
+        The outcome, or a sentence saying why there is none.
+    """
+    try:
+        best = _best_fit(task, train)
+        held_score = score(best.model, held)
+        model = believing(best.model, task.model)
+        residuals = tuple(
+            (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
+            for trial, motion in zip(
+                (*train, *held), (*best.motions, *held_score.motions), strict=True
+            )
+        )
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+    belief = sum(
+        ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
+        for u, v in zip(best.unknowns, best.values, strict=True)
+        if np.isfinite(u.tolerance)
+    )
+    label = best.model.effects[-1].label if task.effect else task.model.name
+    return Outcome(
+        task, label, model, best, held_score, residuals, belief, len(best.unknowns)
+    )
+
+
+def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    # A short horizon tells which start is worth going on from, on the way to the full one.
+    models = list(_starting_models(task))
+    if len(models) == 1:
+        return fit(models[0], train)
+    kept = _swept(models[0])
+    # A few seconds do not show an instant that is still to come.
+    horizon = np.inf if kept and TIME in models[0].effects[-1].extra_inputs else SCREEN_S
+    looks = _looks(models, train, kept, horizon)
+    if kept:
+        # Let go of the frequency only where a fit at its start is promising.
+        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [], horizon)
+    look, _ = looks[0]
+    return fit(models[0], train, start=look)
+
+
+def _swept(model: Model) -> list[str]:
+    # Of the effect that is being tried: those before it stay about where they were found.
+    own = model.effects[-1]
+    return [f'{own.label}.{p.name}' for p in own.parameters if p.swept]
+
+
+def _looks(
+    models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str], horizon: float
+) -> list[tuple[Fit, Model]]:
+    """Short fits from each model and where they lead, best first; `kept` stay as they are."""
+    looks = []
+    for model in models:
+        only = [u.name for u in unknowns_of(model) if u.name not in kept] if kept else None
+        try:
+            look = fit(model, train, only, horizon=horizon, iterations=SCREEN_ITERATIONS)
+            found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
+            looks.append((look, model.with_values(found)))
+        except IdentificationError as error:
+            failure = error
+    if not looks:
+        raise failure
+    return sorted(looks, key=lambda pair: pair[0].normalised_error)
+
+
+def _starting_models(task: Task):
+    if task.effect is None:
+        yield task.model
+        return
+    name, at = task.effect
+    for start in starts_of(name):
+        yield task.model.with_effect(name, at, **start)
+
+
+def believing(fitted: Model, base: Model) -> Model:
+    """The fitted structure with the base's numbers and beliefs; added effects keep their values.
+
+    What a fit found is a start for the next one, not a belief.
+    """
+    added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
+             if n not in base.quantities}
+    return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
+
+
+def chi2(o: Outcome) -> float:
+    """Squared error over noise variance, training and held-out trials together."""
+    return float((o.train.mse * o.train.count).sum() + (o.held.mse * o.held.count).sum())
+
+
+def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
+    """Identified parameters of one effect: name -> (value, standard deviation, unit)."""
+    prefix = f'{label}.'
+    return {
+        u.name.removeprefix(prefix): (float(v), float(s), u.unit)
+        for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
+        if u.name.startswith(prefix)
+    }
+
+
+def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
+    """Parameters of the effect tried: name -> (value, standard deviation, unit)."""
+    return parameters_of(o, o.label)
+
+
+def at_edge(o: Outcome) -> list[str]:
+    """A parameter at the edge of its range says that the effect is not what is meant."""
+    found = []
+    for u, v in zip(o.train.unknowns, o.train.values, strict=True):
+        if not u.name.startswith(f'{o.label}.'):
+            continue
+        low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
+                         for x in (u.lower, u.upper, v))
+        # Ranges suit machines of all sizes: a small value is not yet an edge.
+        margin = 1e-3 * (high - low)
+        if not u.logarithmic:
+            margin = min(margin, 0.1 * u.scale)
+        if min(at - low, high - at) < margin:
+            found.append(f'{u.name} = {v:.3g} {u.unit} lies at the edge of its range')
+    return found

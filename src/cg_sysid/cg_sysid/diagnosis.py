@@ -1,0 +1,208 @@
+"""The answer of a diagnosis as data, and in words.
+
+What was found, what was tried, and the gain; how it is found is in diagnose.py, how it is written
+to disk in diagnosis_file.py.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cg_dynamics.model import Model
+from cg_sysid.identify import Fit
+from cg_sysid.trial import Trial
+
+MOST_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Simulation error of one output before and after, on records held out.
+
+    Attributes:
+        channel: Output channel.
+        unit: Its unit.
+        before: RMS error of the nominal model, identified anew, in `unit`.
+        after: RMS error of the extended model.
+        noise: Noise floor of the sensor.
+    """
+
+    channel: str
+    unit: str
+    before: float
+    after: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect tried on top of a base model.
+
+    Attributes:
+        label: Effect label.
+        model: Base model plus the effect, identified on the training records.
+        train: Fit on the training records.
+        held: Score on the held-out records.
+        evidence: In nats against the base model: positive speaks for the effect.
+        held_gain: Fall of the held-out squared error, relative.
+        significance: The same in standard errors, by the ranks of blocks of time.
+        explained: RMS error explained on held-out records, in noise standard deviations, of the
+            output where it is largest.
+        parameters: Own parameters: name -> (value, standard deviation, unit).
+        reason: Why it was not accepted; empty if it could be.
+    """
+
+    label: str
+    model: Model
+    train: Fit
+    held: Fit
+    evidence: float
+    held_gain: float
+    significance: float
+    explained: float
+    parameters: dict[str, tuple[float, float, str]]
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class Round:
+    """All candidates tried on top of one base model, best first, and what was made of them."""
+
+    base: str
+    candidates: tuple[Candidate, ...]
+    accepted: str
+    independent: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A named cause: an accepted effect and what these data cannot rule out beside it.
+
+    Attributes:
+        label: Label of the effect.
+        parameters: Own parameters: name -> (value, standard deviation, unit).
+        evidence: In nats against the model without it.
+        rivals: Other effects that explain the records as well.
+        places: Labels of the same effect at other places that explain the records as well.
+    """
+
+    label: str
+    parameters: dict[str, tuple[float, float, str]]
+    evidence: float
+    rivals: tuple[str, ...] = ()
+    places: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer.
+
+    Attributes:
+        verdict: consistent, explained, ambiguous, unexplained or unusable.
+        summary: One sentence for people.
+        causes: Named causes, strongest first.
+        gains: Simulation error before and after on held-out records.
+        nominal: The model as it was given.
+        baseline: The same, its parameters identified on the training records.
+        extended: The model with the causes in it, identified on the training records.
+        rounds: What was tried, in order.
+        train: Trials used for fitting.
+        held: Trials held out.
+        remaining: chi2/N of each output that the extended model leaves on held-out records.
+        findings: What a person should know: warnings of the fits, lumps out of tolerance.
+    """
+
+    verdict: str
+    summary: str
+    causes: tuple[Cause, ...]
+    gains: tuple[Gain, ...]
+    nominal: Model
+    baseline: Candidate
+    extended: Candidate
+    rounds: tuple[Round, ...]
+    train: tuple[Trial, ...]
+    held: tuple[Trial, ...]
+    remaining: dict[str, float]
+    findings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a diagnosis is done.
+
+    Attributes:
+        effects: Labels or names to try; by default the whole library.
+        rounds: Most effects to add.
+        workers: Local processes.
+        held: Names of the records to hold out; by default every second one of each set-up.
+    """
+
+    effects: tuple[str, ...] | None = None
+    rounds: int = MOST_ROUNDS
+    workers: int | None = None
+    held: tuple[str, ...] | None = None
+
+
+def effect_name(label: str) -> str:
+    """Standard name of an effect, its place left out."""
+    return label.partition('@')[0]
+
+
+def gains_of(
+    model: Model, held: Sequence[Trial], before: Fit, after: Fit
+) -> tuple[Gain, ...]:
+    """Error of each output before and after on the held-out trials."""
+    sigma = held[0].sigma
+    return tuple(
+        Gain(channel, unit, float(s * np.sqrt(b)), float(s * np.sqrt(a)), float(s))
+        for channel, unit, s, b, a, n in zip(
+            model.mechanism.outputs,
+            model.mechanism.output_units,
+            sigma,
+            per_output(before),
+            per_output(after),
+            before.count.sum(axis=0),
+            strict=True,
+        )
+        if n
+    )
+
+
+def summary_of(
+    verdict: str, causes: Sequence[Cause], gains: Sequence[Gain], left: dict[str, float]
+) -> str:
+    """The answer in one or two sentences."""
+    if verdict == 'consistent':
+        return 'The model explains the records down to the noise of the sensors.'
+    biggest = max(gains, key=lambda g: g.before / g.noise)
+    if verdict == 'unexplained':
+        return (
+            f'Something is missing that no effect of the library explains: {biggest.channel} is '
+            f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
+            f'{biggest.noise:.2g}.'
+        )
+    named = ', '.join(
+        f'{c.label} ({_described(c)})' + (f' or {" or ".join(c.rivals)}' if c.rivals else '')
+        for c in causes
+    )
+    text = (
+        f'The simulation lacks {named}; with it the held-out error of {biggest.channel} falls '
+        f'from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
+        f'(noise {biggest.noise:.2g}).'
+    )
+    if left:
+        text += f' An error above the noise remains in {", ".join(left)}.'
+    return text
+
+
+def _described(cause: Cause) -> str:
+    return ', '.join(
+        f'{name} = {value:.3g} +- {sigma:.1g} {unit}'
+        for name, (value, sigma, unit) in cause.parameters.items()
+    )
+
+
+def per_output(fit: Fit) -> np.ndarray:
+    """chi2/N of each output over all trials; 0 for an output without samples."""
+    return (fit.mse * fit.count).sum(axis=0) / np.maximum(fit.count.sum(axis=0), 1)

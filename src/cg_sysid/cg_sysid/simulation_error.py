@@ -1,0 +1,192 @@
+"""The simulation error of many records and its normal equations: theory.md, (ID).
+
+One evaluation simulates every trial with exact sensitivities and adds up the normal equations.
+Each trial's own unknowns, its initial motion, couple to the shared parameters only, so that a
+Schur complement leaves a system as small as the number of parameters, however many records.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import CompiledModel, Normal, compile_model
+from cg_dynamics.model import Model
+from cg_sysid.trial import Trial
+from cg_sysid.unknowns import Unknown
+
+BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
+
+
+@dataclass
+class Problem:
+    """Compiled models and constants of one fit."""
+
+    model: Model
+    trials: Sequence[Trial]
+    unknowns: tuple[Unknown, ...]
+    compiled: list[CompiledModel] = field(default_factory=list)
+    vectors: list[np.ndarray] = field(default_factory=list)
+    places: list[np.ndarray] = field(default_factory=list)
+    columns: list[np.ndarray] = field(default_factory=list)
+    inputs: list[np.ndarray] = field(default_factory=list)
+    evaluations: int = 0
+
+    def __post_init__(self):
+        names = tuple(u.name for u in self.unknowns)
+        default = compile_free(self.model, names)
+        for trial in self.trials:
+            compiled = compile_model(self.model, trial.setup, default)
+            m2 = 2 * compiled.equations.coordinates
+            self.compiled.append(compiled)
+            self.inputs.append(trial.inputs_for(compiled.input_names))
+            self.vectors.append(parameter_vector(self.model, trial.setup))
+            self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
+            self.columns.append(
+                np.array([m2 + names.index(f) if f in names else -1 for f in compiled.free], int)
+            )
+        self.consistency = _consistency(self.model, names)
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """Coordinates -> values."""
+        return np.array([u.to_value(c) for u, c in zip(self.unknowns, theta, strict=True)])
+
+    def chain(self, values: np.ndarray) -> np.ndarray:
+        """d(value)/d(coordinate)."""
+        return np.array(
+            [v if u.logarithmic else 1.0 for u, v in zip(self.unknowns, values, strict=True)]
+        )
+
+
+def compile_free(model: Model, names: Sequence[str]) -> tuple[str, ...] | None:
+    """Parameters to compile sensitivities for: all declared free, and those asked for besides."""
+    declared = model.declarations
+    if all(declared[name].free for name in names):
+        return None
+    return tuple(n for n, p in declared.items() if p.free or n in names)
+
+
+def _consistency(model: Model, names: tuple[str, ...]):
+    symbols = {name: ca.SX.sym(name) for name in model.declarations}
+    conditions = model.mechanism.consistency(symbols)
+    if not conditions or not names:
+        return None
+    stacked = ca.vertcat(*conditions)
+    moved = ca.vertcat(*(symbols[name] for name in names))
+    function = ca.Function(
+        'consistency', list(symbols.values()), [stacked, ca.jacobian(stacked, moved)]
+    )
+    fixed = model.values
+
+    def evaluate(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        numbers = {**fixed, **dict(zip(names, values, strict=True))}
+        stack, jacobian = function(*numbers.values())
+        return np.asarray(stack).ravel(), np.asarray(ca.densify(jacobian))
+
+    return evaluate
+
+
+@dataclass
+class Point:
+    """Cost and normal equations at one point; None where the simulation runs away."""
+
+    cost: float
+    shared_hessian: np.ndarray
+    shared_gradient: np.ndarray
+    own: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # D, E, g of each trial
+    sse: np.ndarray
+    count: np.ndarray
+    data_cost: float
+
+
+def evaluate(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> Point | None:
+    """Cost and normal equations at one point; None where the simulation runs away."""
+    k = len(theta)
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
+    own, cost = [], 0.0
+    ny = len(problem.trials[0].sigma)
+    sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
+    if problem.consistency is not None:
+        c, jacobian = problem.consistency(values)
+        if not (c > 0).all():
+            return None
+        jacobian = jacobian * chain / c[:, None]
+        cost -= 2 * BARRIER * np.log(c).sum()
+        shared_g -= BARRIER * jacobian.sum(axis=0)
+        shared_h += BARRIER * jacobian.T @ jacobian
+    problem.evaluations += 1
+    for i, trial in enumerate(problem.trials):
+        n, normal, _, _ = simulate_sensitive(problem, i, values, motions[i], horizon)
+        m2 = len(motions[i])
+        if normal.rows < n or not np.isfinite(normal.hessian).all():
+            return None
+        h, g = normal.hessian * weight, normal.gradient * weight
+        h[m2:] *= chain[:, None]
+        h[:, m2:] *= chain
+        g[m2:] *= chain
+        sse[i], count[i] = normal.sse, normal.count
+        away = (motions[i] - trial.motion) / trial.motion_sigma
+        own_h = h[:m2, :m2] + np.diag(1 / trial.motion_sigma**2)
+        own_g = g[:m2] + away / trial.motion_sigma
+        own.append((own_h, h[:m2, m2:], own_g))
+        shared_h += h[m2:, m2:]
+        shared_g += g[m2:]
+        cost += weight * normal.sse.sum() + away @ away
+    data_cost = cost
+    for j, u in enumerate(problem.unknowns):
+        if np.isfinite(u.tolerance):
+            away = (theta[j] - u.to_coordinate(u.prior)) / u.tolerance
+            cost += away**2
+            shared_g[j] += away / u.tolerance
+            shared_h[j, j] += 1 / u.tolerance**2
+    return Point(cost, shared_h, shared_g, own, sse, count, data_cost)
+
+
+def simulate_sensitive(
+    problem: Problem,
+    i: int,
+    values: np.ndarray,
+    motion: np.ndarray,
+    horizon: float,
+    keep: bool = False,
+) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
+    """One trial: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
+
+    Columns: the trial's own initial motion, then the shared values (not coordinates).
+    """
+    trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
+    p = problem.vectors[i]
+    p[problem.places[i]] = values
+    n = int(np.searchsorted(trial.time, horizon, side='right'))
+    x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)
+    m2 = len(motion)
+    s0 = np.zeros((compiled.nx, m2 + len(values)))
+    s0[:, :m2] = by_motion
+    for f, column in enumerate(problem.columns[i]):
+        if column >= 0:
+            s0[:, column] = by_free[:, f]
+    normal, y, jacobian = compiled.normal(
+        trial.time[:n], u[:n], x0, s0, p, problem.columns[i], trial.outputs[:n], 1 / trial.sigma,
+        keep=keep,
+    )  # fmt: skip
+    return n, normal, y, jacobian
+
+
+def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]:
+    """Schur complement on the shared unknowns, with Marquardt damping on every diagonal."""
+    h = point.shared_hessian + damping * np.diag(np.diag(point.shared_hessian))
+    g = point.shared_gradient.copy()
+    factors = []
+    for d, e, own_g in point.own:
+        damped = d + damping * np.diag(np.diag(d))
+        solved = np.linalg.solve(damped, np.column_stack([e, own_g]))
+        h -= e.T @ solved[:, :-1]
+        g -= e.T @ solved[:, -1]
+        factors.append(solved)
+    return h, g, factors

@@ -1,0 +1,76 @@
+"""How sure identified values are: theory.md, (COV)."""
+
+import numpy as np
+
+from cg_sysid.simulation_error import Point, Problem, evaluate, reduced, simulate_sensitive
+
+SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
+
+
+def uncertainty(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the coordinates and the share of each that comes from data: theory.md, (COV).
+
+    Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
+    right for white residuals, and the sandwich of scores summed over blocks longer than their
+    correlation, right where the model leaves slow waves.
+    """
+    point = evaluate(problem, theta, motions, horizon, weight)
+    k = len(theta)
+    if not k or point is None:
+        return np.zeros((k, k)), np.zeros(k)
+    belief = np.array(
+        [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in problem.unknowns]
+    )
+    h, _, _ = reduced(point, 0.0)
+    excess = max(1.0, point.sse.sum() / point.count.sum())
+    rescale = 1 / (excess * weight)
+    h = (h - np.diag(belief)) * rescale + np.diag(belief)
+    inverse, lost = _inverse(h)
+    scores = _block_scores(problem, theta, motions, horizon, point, weight) * rescale
+    sandwich = inverse @ (scores.T @ scores + np.diag(belief)) @ inverse
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
+    covariance = inverse * np.outer(ratio, ratio)
+    covariance[lost, lost] = np.inf
+    certain = np.where(belief > 0, np.diag(covariance), 0.0)
+    information = 1 - np.clip(certain * belief, 0, 1)
+    information[lost] = 0.0
+    return covariance, information
+
+
+def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of the curvature, and which unknowns it leaves undetermined."""
+    scale = np.sqrt(np.maximum(np.diag(h), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    # A direction that neither data nor belief determine has infinite variance, not a crash.
+    kept = eigenvalues > 1e-13 * eigenvalues.max()
+    inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T
+    lost = (vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6
+    return inverse / np.outer(scale, scale), lost
+
+
+def _block_scores(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    point: Point,
+    weight: float,
+) -> np.ndarray:
+    """Gradient of the cost by the shared unknowns, block by block of time, shape (blocks, k)."""
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    blocks = []
+    for i, trial in enumerate(problem.trials):
+        n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
+        assert y is not None
+        assert jacobian is not None
+        residual = np.nan_to_num((y - trial.outputs[:n]) / trial.sigma**2) * weight
+        rows = np.einsum('kj,kjc->kc', residual, jacobian)
+        edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))
+        sums = np.add.reduceat(rows, edges, axis=0)
+        m2 = len(motions[i])
+        own, cross, _ = point.own[i]
+        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ np.linalg.solve(own, cross))
+    return np.vstack(blocks)

@@ -1,0 +1,86 @@
+"""What an identification moves: parameters, what is believed of them, and in which coordinate."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cg_dynamics.model import Model
+
+RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
+
+
+class IdentificationError(ValueError):
+    """An identification that cannot be done; the message says why."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A shared parameter to be identified, in the coordinate in which it is moved.
+
+    Attributes:
+        name: Full parameter name.
+        unit: SI unit.
+        prior: Centre of what the model file believes.
+        tolerance: Standard deviation of that belief; infinite where there is none. For a
+            logarithmic unknown it is relative.
+        lower: Smallest allowed value.
+        upper: Largest allowed value.
+        logarithmic: Moved as log(value).
+        scale: Typical change, for damping.
+    """
+
+    name: str
+    unit: str
+    prior: float
+    tolerance: float
+    lower: float
+    upper: float
+    logarithmic: bool
+    scale: float
+
+    def to_coordinate(self, value: float) -> float:
+        """Value -> coordinate."""
+        return float(np.log(value)) if self.logarithmic else value
+
+    def to_value(self, coordinate: float) -> float:
+        """Coordinate -> value."""
+        value = float(np.exp(coordinate)) if self.logarithmic else float(coordinate)
+        return min(max(value, self.lower), self.upper)
+
+
+def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknown, ...]:
+    """The parameters of a model that identification moves: declared free, not fixed in the file.
+
+    Raises:
+        IdentificationError: if `only` names something that the model does not have.
+    """
+    declared = model.declarations
+    if only is not None:
+        for name in only:
+            if name not in declared:
+                raise IdentificationError(
+                    f'no parameter {name!r} to identify; there are: {", ".join(declared)}'
+                )
+    found = []
+    for name, parameter in declared.items():
+        q = model.quantities[name]
+        if (only is None and (q.fixed or not parameter.free)) or (
+            only is not None and name not in only
+        ):
+            continue
+        if not np.isfinite(q.value):
+            continue
+        tolerance = q.tolerance
+        if tolerance is None:
+            belongs = '.' not in name
+            tolerance = RELATIVE_TOLERANCE * abs(q.value) if belongs and q.value else np.inf
+        if parameter.logarithmic and np.isfinite(tolerance):
+            tolerance = tolerance / q.value
+        found.append(
+            Unknown(
+                name, parameter.unit, q.value, tolerance, parameter.lower,
+                parameter.upper, parameter.logarithmic, parameter.scale,
+            )
+        )  # fmt: skip
+    return tuple(found)
