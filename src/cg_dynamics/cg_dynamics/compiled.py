@@ -37,6 +37,8 @@ FLAGS = (
 )  # fmt: skip
 MAX_COLUMNS = 64
 REFERENCE_STEP = 0.002
+SMALLEST_STEP = 1e-4
+STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
 
 
 def cache_directory() -> Path:
@@ -103,6 +105,7 @@ class CompiledModel:
         )
         self.f = ca.Function('f', [e.x, e.u, e.p], [e.rates], ['x', 'u', 'p'], ['dx'])
         self.h = ca.Function('h', [e.x, e.u, e.p], [e.outputs], ['x', 'u', 'p'], ['y'])
+        self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], [ca.jacobian(e.rates, e.x)])
         self.has_delays = not delays.is_zero()
         if library is None:
             from cg_dynamics.fallback import InterpretedRollout
@@ -138,6 +141,26 @@ class CompiledModel:
         x[:m2] = motion
         full, by_x, by_p = self._initial(x, u, p)
         return np.asarray(full).ravel(), np.asarray(by_x)[:, :m2], np.asarray(by_p)
+
+    def step_for(self, x0: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:
+        """Longest integration step in s at which this motion is simulated well.
+
+        Dry friction, smoothed, is stiffest at standstill under load: there a time constant of
+        the linearised model can be far below a sample, and Runge-Kutta's step has to follow it.
+
+        Args:
+            x0: State whose pose counts, shape (nx,).
+            u: Inputs, shape (n, nu); the largest of each counts.
+            p: Parameter vector.
+        """
+        m = self.equations.coordinates
+        still = np.array(x0, float)
+        still[m : 2 * m] = 0.0
+        matrix = np.asarray(self._stiffness(still, np.abs(u).max(axis=0), p))
+        if not np.isfinite(matrix).all():
+            return self.largest_step
+        fastest = np.abs(np.linalg.eigvals(matrix)).max()
+        return max(SMALLEST_STEP, min(self.largest_step, STIFFNESS / max(fastest, 1e-9)))
 
     def delayed_inputs(
         self, time: np.ndarray, u: np.ndarray, delay: float
@@ -182,7 +205,7 @@ class CompiledModel:
         late = _array(late)
         states = np.empty((len(time), self.nx))
         rows = self._c.cgm_simulate(
-            len(time), _array(np.diff(time)), self.largest_step, late, x0, p, states
+            len(time), _array(np.diff(time)), self.step_for(x0, u, p), late, x0, p, states
         )
         if rows < len(time):
             raise SimulationError(
@@ -257,7 +280,7 @@ class CompiledModel:
         y = np.full((n, self.ny), np.nan) if keep else None
         j = np.zeros((n, self.ny, nc)) if keep else None
         rows = self._c.cgm_normal(
-            n, time, self.largest_step, _array(late), _array(slope), delay_columns[0], x0, s0, p,
+            n, time, self.step_for(x0, u, p), _array(late), _array(slope), delay_columns[0], x0, s0, p,
             nc, column, measured, weight, _array(output_delays),
             np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,

@@ -17,6 +17,7 @@ from cg_dynamics.model import Model
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import Unknown
 
+RUNAWAY = 1e60
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 
 
@@ -124,7 +125,8 @@ def evaluate(
     for i, trial in enumerate(problem.trials):
         n, normal, _, _ = simulate_sensitive(problem, i, values, motions[i], horizon)
         m2 = len(motions[i])
-        if normal.rows < n or not np.isfinite(normal.hessian).all():
+        # Sensitivities can run away before the motion does.
+        if normal.rows < n or not np.abs(normal.hessian).max() < RUNAWAY:
             return None
         h, g = normal.hessian * weight, normal.gradient * weight
         h[m2:] *= chain[:, None]
