@@ -26,7 +26,7 @@ PROGRAMME = (
     'swing_inner_fixed',
     'swing_outer_fixed',
 ) * 2
-DURATION = 8.0  # s
+DURATION = 6.0  # s
 
 FIRST_LIBRARY = (
     'actuator_delay',

@@ -55,7 +55,7 @@ def test_file_is_saved_whole(robot, tmp_path):
     ('path', 'value', 'message'),
     [
         (('parameters', 'c1', 'unit'), 'kg', "parameters.c1: unit is 'kg', expected '1'"),
-        (('parameters', 'c1'), None, r'parameters.c1 \(1, inertia.*missing'),
+        (('parameters', 'c1'), None, r'parameters.c1 \(1, inner legs.*missing'),
         (('parameters', 'c1', 'value'), 9.0, r'c1 = 9 1 is outside its range \[1e-05, 2\]'),
         (('parameters', 'c9'), {'value': 1, 'unit': '1'}, "unknown entry 'c9'; allowed: leg_len"),
         (('parameters', 'c4', 'value'), 0.9, 'no real bodies have these parameters: condition 4'),

@@ -1,7 +1,7 @@
 """One effect on top of a model: where it can act, where its fit sets out, and how well it does."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -44,13 +44,21 @@ class Outcome:
 
 
 def candidates_for(
-    model: Model, setups: Sequence[Setup], names: Sequence[str] | None = None
+    model: Model,
+    setups: Sequence[Setup],
+    names: Sequence[str] | None = None,
+    recorded: Collection[str] = (),
 ) -> list[tuple[str, str | None]]:
-    """(effect, at) of all that could show in these set-ups and that the model does not have."""
+    """(effect, at) of all that could show in these set-ups and that the model does not have.
+
+    An effect that needs a switch (`drive_enabled`) is tried only where that was recorded: with
+    the switch always on it would be another name for a simpler effect.
+    """
+    known = {*model.mechanism.inputs, TIME, *recorded}
     present = {effect.label for effect in model.effects}
     found = []
     for name, effect in LIBRARY.items():
-        if not effect.applies(setups):
+        if not effect.applies(setups) or not known.issuperset(effect.extra_inputs):
             continue
         for at in effect.sites(model.mechanism):
             made = effect(model.mechanism, at)

@@ -177,7 +177,8 @@ class _Search:
 
     def _round(self, base: Outcome) -> tuple[list[tuple[Candidate, Outcome]], float]:
         setups = [trial.setup for trial in (*self.train, *self.held)]
-        effects = candidates_for(base.model, setups, self.options.effects)
+        recorded = {name for trial in self.train for name in trial.input_names}
+        effects = candidates_for(base.model, setups, self.options.effects, recorded)
         tasks = [Task(base.model, effect) for effect in effects]
         outcomes = self._fit(tasks, f'effects on top of {base.label}')
         for task, outcome in zip(tasks, outcomes, strict=True):

@@ -31,3 +31,10 @@ def test_only_effects_that_can_show_are_tried(model_file):
               'boom_mass'}  # fmt: skip
     assert free - fixed == unseen
     assert not {'spring_damping', 'spring_nonlinearity'} & free
+
+
+def test_an_effect_of_a_switch_is_tried_where_the_switch_was_recorded(model_file):
+    nominal = Model.load(model_file)
+    without = {name for name, _ in candidates_for(nominal, [Setup()])}
+    recorded = {name for name, _ in candidates_for(nominal, [Setup()], None, {'drive_enabled'})}
+    assert recorded - without == {'back_emf'}
