@@ -280,8 +280,8 @@ class CompiledModel:
         y = np.full((n, self.ny), np.nan) if keep else None
         j = np.zeros((n, self.ny, nc)) if keep else None
         rows = self._c.cgm_normal(
-            n, time, self.step_for(x0, u, p), _array(late), _array(slope), delay_columns[0], x0, s0, p,
-            nc, column, measured, weight, _array(output_delays),
+            n, time, self.step_for(x0, u, p), _array(late), _array(slope), delay_columns[0],
+            x0, s0, p, nc, column, measured, weight, _array(output_delays),
             np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip

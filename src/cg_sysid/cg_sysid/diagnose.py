@@ -175,7 +175,9 @@ class _Search:
             progress=lambda done, total: self.progress(what, done, total),
         )
 
-    def _round(self, base: Outcome) -> tuple[list[tuple[Candidate, Outcome]], float]:
+    def _round(
+        self, base: Outcome, accepted: Outcome | None = None
+    ) -> tuple[list[tuple[Candidate, Outcome]], float]:
         setups = [trial.setup for trial in (*self.train, *self.held)]
         recorded = {name for trial in self.train for name in trial.input_names}
         effects = candidates_for(base.model, setups, self.options.effects, recorded)
@@ -185,6 +187,8 @@ class _Search:
             if isinstance(outcome, str):
                 log.info('%s: %s', task.effect, outcome)
         good = [o for o in outcomes if isinstance(o, Outcome)]
+        if accepted is not None and all(o.label != accepted.label for o in good):
+            good.append(accepted)
         return self._rank(base, good)
 
     def _rank(
@@ -272,7 +276,8 @@ class _Search:
             if isinstance(lean, str):
                 causes.append(Cause(label, parameters_of(final, label), np.inf))
                 continue
-            ranked, independent = self._round(lean)
+            # Its fit on top of the others alone may fail; what was accepted then stands.
+            ranked, independent = self._round(lean, accepted=replace(final, label=label))
             candidates = tuple(c for c, _ in ranked)
             base = ' + '.join(['nominal', *(x for x in labels if x != label)])
             self.rounds.append(Round(base, candidates, label, independent))
