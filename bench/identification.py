@@ -249,7 +249,11 @@ def main():
     text = '\n'.join(lines) + '\n'
     print(text)
     if options.out:
-        options.out.write_text(f'# Identification\n\n`python bench/identification.py`\n\n{text}')
+        command = f'python bench/identification.py --limit {options.limit:g}'
+        options.out.write_text(
+            f'# Identification\n\nCommand: `{command}`. A slow run is cut off after '
+            f'{options.limit:g} s of CPU.\n\n{text}'
+        )
 
 
 if __name__ == '__main__':
