@@ -1,6 +1,6 @@
 """How often the right cause is named: effects hidden in simulated machines, many sizes and seeds.
 
-    ./cg python bench/hidden_effects.py [--seeds 3] [--effects a,b] [--write]
+    ./cg exec python bench/hidden_effects.py [--seeds 3] [--effects a,b] [--faults] [--write FILE]
 
 Each case: an effect of a size drawn from cg_bringup/config/hidden_effects.yaml is put into a robot
 whose numbers are 10 to 20 % off the nominal file, the four identification set-ups are recorded

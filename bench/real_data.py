@@ -1,6 +1,6 @@
 """Real machines: import, check, identify, diagnose, and judge on records no choice has seen.
 
-    ./cg python bench/real_data.py DATA_DIR [--only NAME] [--out docs/results_tables.md]
+    ./cg exec python bench/real_data.py DATA_DIR [--only NAME] [--out FILE]
 
 DATA_DIR holds the folders of docs/data.md. Each set is cut into records that the diagnosis may
 use (it splits them into training and held-out by itself, to choose among effects) and records on
