@@ -1,6 +1,6 @@
 """Identification by simulation error: ours beside Nelder-Mead and scipy least_squares, one run.
 
-    ./cg exec python bench/identification.py [--starts 100] [--slow-starts 3] [--limit 150] [--out FILE]
+    ./cg exec python bench/identification.py [--starts 100] [--limit 150] [--out FILE]
 
 The problem: 8 parameters (six lumps, viscous and dry friction), four records of 5 s at 500 Hz
 (one per set-up) of a robot whose parameters are known, with sensor noise. Every method minimises
