@@ -198,7 +198,7 @@ def summary_of(
 
 def _described(cause: Cause) -> str:
     return ', '.join(
-        f'{name} = {value:.3g} +- {sigma:.1g} {unit}'
+        f'{name} = {value:.3g} +- {sigma:.1g}' + ('' if unit == '1' else f' {unit}')
         for name, (value, sigma, unit) in cause.parameters.items()
     )
 
