@@ -24,6 +24,8 @@ class Parameter:
         logarithmic: True where the ratio of two values means more than their difference.
         swept: True for a frequency or an instant, where the error has many local minima: a first
             look keeps it at each of its starts.
+        each: True for what every record has of its own, as an instant; the value in a model
+            stands for records that nobody has seen.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Parameter:
     scale: float = 1.0
     logarithmic: bool = False
     swept: bool = False
+    each: bool = False
 
     @property
     def default(self) -> float:

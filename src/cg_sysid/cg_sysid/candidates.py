@@ -1,7 +1,7 @@
 """One effect on top of a model: where it can act, where its fit sets out, and how well it does."""
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,22 +11,35 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid.events import seek_events
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError
+from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 MOST_STARTS = 24
 FOLLOWED = 3  # starts of a swept parameter that are worth a second look
+SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
+WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
+SETTLED = 1.2  # chi2/N at which nothing is left to find
+SURE = 5.0  # standard deviations from which an event of a record is not chance
 
 
 @dataclass(frozen=True)
 class Task:
-    """One candidate to fit: an effect (or None for the base alone) on top of a model."""
+    """One candidate to fit: an effect (or None for the base alone) on top of a model.
+
+    Attributes:
+        model: The base.
+        effect: Effect and place.
+        events: What happened in each trial alone, as far as the base knows it: name of the trial
+            -> own values (unknowns.own_unknowns).
+    """
 
     model: Model
     effect: tuple[str, str | None] | None = None
+    events: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -41,6 +54,8 @@ class Outcome:
     residuals: tuple[np.ndarray, ...] = field(repr=False)
     belief: float
     unknowns: int
+    events: Mapping[str, np.ndarray]
+    trials: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
 
 
 def candidates_for(
@@ -76,9 +91,10 @@ def candidates_for(
 def starts_of(name: str) -> list[dict[str, float]]:
     """Values of an effect's parameters from which its identification sets out."""
     grids = [
-        [(p.name, start) for start in p.starts] if p.free else [(p.name, p.default)]
+        [(p.name, start) for start in p.starts] if p.free and not p.each
+        else [(p.name, p.default if p.neutral is None else p.neutral)]
         for p in LIBRARY[name].parameters
-    ]
+    ]  # fmt: skip
     return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
 
 
@@ -90,7 +106,12 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     """
     try:
         best = _best_fit(task, train)
-        held_score = score(best.model, held)
+        events = _events_of(best, train)
+        if best.own:
+            known = {t.name: task.events[t.name] for t in held if t.name in task.events}
+            events |= known or seek_events(best.model, held, _surest(best))
+        held_score = score(best.model, held, own=events)
+        events |= _events_of(held_score, held)
         model = believing(best.model, task.model)
         residuals = tuple(
             (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
@@ -107,24 +128,65 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     )
     label = best.model.effects[-1].label if task.effect else task.model.name
     return Outcome(
-        task, label, model, best, held_score, residuals, belief, len(best.unknowns)
-    )
+        task, label, model, best, held_score, residuals, belief,
+        len(best.unknowns) + len(best.own) * (len(train) + len(held)), events,
+        (tuple(t.name for t in train), tuple(t.name for t in held)),
+    )  # fmt: skip
+
+
+def _events_of(found: Fit, trials: Sequence[Trial]) -> dict[str, np.ndarray]:
+    count = len(found.own)
+    return {
+        trial.name: motion[len(motion) - count :]
+        for trial, motion in zip(trials, found.motions, strict=True)
+        if count
+    }
+
+
+def _surest(found: Fit) -> list[np.ndarray]:
+    """Own values of the trials in which something surely happened."""
+    own = [motion[-len(found.own) :] for motion in found.motions]
+    sure = [
+        abs(values[0]) / max(sigmas[0], 1e-300)
+        for values, sigmas in zip(own, found.own_sigmas, strict=True)
+    ]
+    order = sorted(range(len(own)), key=lambda i: -sure[i])
+    return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    if own_unknowns(task.model) == () != own_unknowns(next(_starting_models(task))):
+        return _event_fit(task, train)
     # A short horizon tells which start is worth going on from, on the way to the full one.
     models = list(_starting_models(task))
     if len(models) == 1:
-        return fit(models[0], train)
+        return fit(models[0], train, own=task.events)
     kept = _swept(models[0])
-    # A few seconds do not show an instant that is still to come.
-    horizon = np.inf if kept and TIME in models[0].effects[-1].extra_inputs else SCREEN_S
-    looks = _looks(models, train, kept, horizon)
+    looks = _looks(models, train, kept, task.events)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
-        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [], horizon)
+        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [], task.events)
     look, _ = looks[0]
     return fit(models[0], train, start=look)
+
+
+def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    """An effect of which every record has its own size and instant."""
+    settled = fit(task.model, train)
+    nothing = settled.normalised_error
+    best: Fit | None = None
+    for _ in range(SEEKINGS):
+        # What was a push is at first taken for other parameters: seek again when it is not.
+        at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
+        model = next(_starting_models(task))
+        events = seek_events(model.with_values(at), train)
+        settled = fit(model, train, at=at, own=events)
+        if best is None or settled.normalised_error < best.normalised_error:
+            best = settled
+        if best.normalised_error > WORTH_SEEKING * nothing or best.normalised_error < SETTLED:
+            break
+    assert best is not None
+    return best
 
 
 def _swept(model: Model) -> list[str]:
@@ -134,14 +196,19 @@ def _swept(model: Model) -> list[str]:
 
 
 def _looks(
-    models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str], horizon: float
+    models: Sequence[Model],
+    train: Sequence[Trial],
+    kept: Sequence[str],
+    events: Mapping[str, np.ndarray],
 ) -> list[tuple[Fit, Model]]:
     """Short fits from each model and where they lead, best first; `kept` stay as they are."""
     looks = []
     for model in models:
         only = [u.name for u in unknowns_of(model) if u.name not in kept] if kept else None
         try:
-            look = fit(model, train, only, horizon=horizon, iterations=SCREEN_ITERATIONS)
+            look = fit(
+                model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS, own=events
+            )
             found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
             looks.append((look, model.with_values(found)))
         except IdentificationError as error:
@@ -176,13 +243,39 @@ def chi2(o: Outcome) -> float:
 
 
 def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
-    """Identified parameters of one effect: name -> (value, standard deviation, unit)."""
+    """Identified parameters of one effect: name -> (value, standard deviation, unit).
+
+    Of what every record has of its own, that of the record where it is surest.
+    """
     prefix = f'{label}.'
-    return {
+    shared = {
         u.name.removeprefix(prefix): (float(v), float(s), u.unit)
         for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
         if u.name.startswith(prefix)
     }
+    surest = max(events_of(o, label).values(), key=_sureness, default={})
+    return {**surest, **shared}
+
+
+def events_of(o: Outcome, label: str) -> dict[str, dict[str, tuple[float, float, str]]]:
+    """What surely happened in single records: record -> own parameter -> (value, sigma, unit)."""
+    found = {}
+    for f, names in ((o.train, o.trials[0]), (o.held, o.trials[1])):
+        for name, motion, sigmas in zip(names, f.motions, f.own_sigmas, strict=True):
+            values = motion[len(motion) - len(f.own) :]
+            row = {
+                u.name.removeprefix(f'{label}.'): (float(v), float(s), u.unit)
+                for u, v, s in zip(f.own, values, sigmas, strict=True)
+                if u.name.startswith(f'{label}.')
+            }
+            if row and _sureness(row) > SURE:
+                found[name] = row
+    return found
+
+
+def _sureness(event: Mapping[str, tuple[float, float, str]]) -> float:
+    size, sigma, _ = next(iter(event.values()))
+    return abs(size) / max(sigma, 1e-300)
 
 
 def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:

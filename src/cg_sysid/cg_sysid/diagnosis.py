@@ -4,8 +4,8 @@ What was found, what was tried, and the gain; how it is found is in diagnose.py,
 to disk in diagnosis_file.py.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -85,6 +85,8 @@ class Cause:
         evidence: In nats against the model without it.
         rivals: Other effects that explain the records as well.
         places: Labels of the same effect at other places that explain the records as well.
+        events: What happened in single records: record -> parameter -> (value, standard
+            deviation, unit).
     """
 
     label: str
@@ -92,6 +94,7 @@ class Cause:
     evidence: float
     rivals: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
+    events: Mapping[str, Mapping[str, tuple[float, float, str]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

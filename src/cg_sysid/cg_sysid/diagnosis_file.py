@@ -217,6 +217,10 @@ def _cause(cause: Cause, model: Model) -> Facts:
         'evidence_nats': cause.evidence,
         'rivals': [_effect(rival) for rival in cause.rivals],
         'places': list(cause.places),
+        'events': {
+            record: _values(values, cause.label, ranges)
+            for record, values in cause.events.items()
+        },
     }
 
 
@@ -428,7 +432,7 @@ def _finding(f: Finding) -> Facts:
         'severity': f.severity,
         'where': f.where,
         'place': f.place,
-        'message': f.message,
+        'message': f.text,
         'start_s': f.start_s,
         'stop_s': f.stop_s,
     }

@@ -21,10 +21,10 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
-from cg_sysid.simulation_error import Point, Problem, evaluate, reduced
+from cg_sysid.simulation_error import Point, Problem, evaluate, own_values, reduced
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
-from cg_sysid.unknowns import IdentificationError, Unknown, unknowns_of
+from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknowns_of
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
@@ -45,7 +45,10 @@ class Fit:
         covariance: Of the unknowns' coordinates (log where logarithmic), shape (k, k).
         information: Share of each unknown's certainty that comes from data, 0 (all from the
             model file's belief) to 1.
-        motions: Initial motion of each trial, (2m,) each.
+        motions: What each trial has of its own: initial motion, (2m,), then one value for each
+            of `own`.
+        own: Parameters of which every record has a value of its own (a push's instant).
+        own_sigmas: Standard deviation of these, shape (len(own),) for each trial.
         cost: Final cost J, in squared noise standard deviations.
         mse: Mean squared error of each trial and output, in squared noise, shape (trials, ny).
         count: Samples behind `mse`.
@@ -63,6 +66,8 @@ class Fit:
     covariance: np.ndarray
     information: np.ndarray
     motions: tuple[np.ndarray, ...]
+    own: tuple[Unknown, ...]
+    own_sigmas: tuple[np.ndarray, ...]
     cost: float
     mse: np.ndarray
     count: np.ndarray
@@ -96,6 +101,7 @@ def fit(
     horizon: float = np.inf,
     start: Fit | None = None,
     at: Mapping[str, float] | None = None,
+    own: Mapping[str, np.ndarray] | None = None,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -108,6 +114,8 @@ def fit(
         horizon: Use only this much of each record, in s: a cheap first look.
         start: Set out from this fit of the same unknowns to a shorter horizon instead.
         at: Set out from these values (full name -> value) instead of those of the file.
+        own: Name of a trial -> first guess of what it has of its own beyond its initial motion
+            (`own_unknowns`); without one the model's values are the guess.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -116,10 +124,10 @@ def fit(
         raise IdentificationError('no record to identify from; at least one is needed')
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only)
-    problem = Problem(model, trials, unknowns)
+    problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}))
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
-    motions = [trial.motion for trial in trials] if start is None else list(start.motions)
+    motions = list(problem.guesses if start is None else start.motions)
     longest = min(max(trial.duration for trial in trials), horizon)
     weight = 1.0 if start is None else 1 / start.inflation
     stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
@@ -145,7 +153,7 @@ def fit(
         weight = new
     assert point is not None
     values = problem.values(theta)
-    covariance, information = uncertainty(problem, theta, motions, longest, weight)
+    covariance, information, own_sigmas = uncertainty(problem, theta, motions, longest, weight)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
     result = Fit(
         model=fitted,
@@ -154,6 +162,8 @@ def fit(
         covariance=covariance,
         information=information,
         motions=tuple(motions),
+        own=problem.own,
+        own_sigmas=own_sigmas,
         cost=point.cost,
         mse=point.sse / np.maximum(point.count, 1),
         count=point.count,
@@ -164,6 +174,15 @@ def fit(
         converged=converged,
     )
     return replace(result, warnings=tuple(_warnings(result)))
+
+
+def _guesses(
+    model: Model, trials: Sequence[Trial], own: Mapping[str, np.ndarray]
+) -> list[np.ndarray]:
+    stated = np.array([u.prior for u in own_unknowns(model)])
+    if not len(stated):
+        return [trial.motion for trial in trials]
+    return [np.concatenate([trial.motion, own.get(trial.name, stated)]) for trial in trials]
 
 
 def _minimise(
@@ -311,18 +330,30 @@ def _warnings(fit: Fit):
 
 
 def predict(model: Model, trial: Trial, motion: np.ndarray) -> np.ndarray:
-    """Outputs that a model simulates along a trial from an initial motion, shape (n, ny)."""
+    """Outputs that a model simulates along a trial, shape (n, ny).
+
+    Args:
+        model: The model.
+        trial: The trial.
+        motion: What the trial has of its own (Fit.motions).
+    """
+    own = own_unknowns(model)
+    happened = dict(zip((u.name for u in own), own_values(own, motion), strict=True))
+    model = model.with_values(happened)
     compiled = compile_model(model, trial.setup)
     p = parameter_vector(model, trial.setup)
     u = trial.inputs_for(compiled.input_names)
-    x0 = compiled.initial_state(motion, u[0], p)
+    x0 = compiled.initial_state(motion[: len(motion) - len(own)], u[0], p)
     states = compiled.simulate(trial.time, u, x0, p)
     return compiled.outputs(trial.time, u, states, p)
 
 
-def score(model: Model, trials: Sequence[Trial]) -> Fit:
+def score(
+    model: Model, trials: Sequence[Trial], own: Mapping[str, np.ndarray] | None = None
+) -> Fit:
     """How well a model simulates trials that it was not fitted to.
 
-    Only each trial's initial motion is fitted, as no recording states it exactly.
+    Only what each trial has of its own is fitted: its initial motion, as no recording states it
+    exactly, and what happened in it alone, from the guess `own` (see `fit`).
     """
-    return fit(model, trials, only=())
+    return fit(model, trials, only=(), own=own)

@@ -19,7 +19,7 @@ from cg_dynamics.model import Model
 from cg_sysid.identify import Fit, score
 from cg_sysid.simulation_error import Problem
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, unknowns_of
+from cg_sysid.unknowns import IdentificationError, own_unknowns, unknowns_of
 
 EVALUATIONS_PER_UNKNOWN = 200  # the limit of fminsearch
 TOLERANCE = 1e-4  # of fminsearch: on the simplex, relative to each start, and on the cost
@@ -54,8 +54,14 @@ def nelder_mead(
     unknowns = unknowns_of(model, only)
     if not unknowns:
         raise IdentificationError(f'model {model.name!r} has no free parameter to identify')
+    if own_unknowns(model):
+        raise IdentificationError(
+            f'a simplex search cannot find what each record has of its own, as '
+            f'{own_unknowns(model)[0].name}; use gauss-newton'
+        )
     began = clock.perf_counter()
-    cost = _Cost(Problem(model, trials, unknowns), _motions(model, trials))
+    guesses = [trial.motion for trial in trials]
+    cost = _Cost(Problem(model, trials, unknowns, guesses), _motions(model, trials))
     values = np.array([u.prior for u in unknowns])
     if cost(values) >= RUNAWAY:
         raise IdentificationError(
@@ -86,6 +92,8 @@ def nelder_mead(
         covariance=np.diag(np.full(k, np.inf)),
         information=np.full(k, np.nan),
         motions=tuple(cost.motions),
+        own=(),
+        own_sigmas=tuple(np.zeros(0) for _ in trials),
         cost=float(sse.sum()),
         mse=sse / np.maximum(count, 1),
         count=count,

@@ -15,7 +15,7 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, Normal, compile_model
 from cg_dynamics.model import Model
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import Unknown
+from cg_sysid.unknowns import Unknown, awake, own_unknowns
 
 RUNAWAY = 1e60
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
@@ -23,30 +23,48 @@ BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one sq
 
 @dataclass
 class Problem:
-    """Compiled models and constants of one fit."""
+    """Compiled models and constants of one fit.
+
+    What a trial has of its own is one vector: its initial motion, then the values of
+    `own_unknowns`. It is believed to lie at `guesses`, give or take `spreads`.
+    """
 
     model: Model
     trials: Sequence[Trial]
     unknowns: tuple[Unknown, ...]
+    guesses: Sequence[np.ndarray]
+    spreads: list[np.ndarray] = field(default_factory=list)
+    own: tuple[Unknown, ...] = ()
     compiled: list[CompiledModel] = field(default_factory=list)
     vectors: list[np.ndarray] = field(default_factory=list)
     places: list[np.ndarray] = field(default_factory=list)
+    own_places: list[np.ndarray] = field(default_factory=list)
     columns: list[np.ndarray] = field(default_factory=list)
     inputs: list[np.ndarray] = field(default_factory=list)
     evaluations: int = 0
 
     def __post_init__(self):
         names = tuple(u.name for u in self.unknowns)
+        self.own = own_unknowns(self.model)
+        own = [u.name for u in self.own]
         default = compile_free(self.model, names)
+        model = awake(self.model)
         for trial in self.trials:
-            compiled = compile_model(self.model, trial.setup, default)
+            compiled = compile_model(model, trial.setup, default)
             m2 = 2 * compiled.equations.coordinates
+            order = [*own, *names]
+            self.spreads.append(
+                np.concatenate([trial.motion_sigma, [u.tolerance for u in self.own]])
+            )
+            self.own_places.append(
+                np.array([compiled.parameter_names.index(n) for n in own], int)
+            )
             self.compiled.append(compiled)
             self.inputs.append(trial.inputs_for(compiled.input_names))
             self.vectors.append(parameter_vector(self.model, trial.setup))
             self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
             self.columns.append(
-                np.array([m2 + names.index(f) if f in names else -1 for f in compiled.free], int)
+                np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)
             )
         self.consistency = _consistency(self.model, names)
 
@@ -122,7 +140,7 @@ def evaluate(
         shared_g -= BARRIER * jacobian.sum(axis=0)
         shared_h += BARRIER * jacobian.T @ jacobian
     problem.evaluations += 1
-    for i, trial in enumerate(problem.trials):
+    for i in range(len(problem.trials)):
         n, normal, _, _ = simulate_sensitive(problem, i, values, motions[i], horizon)
         m2 = len(motions[i])
         # Sensitivities can run away before the motion does.
@@ -133,9 +151,9 @@ def evaluate(
         h[:, m2:] *= chain
         g[m2:] *= chain
         sse[i], count[i] = normal.sse, normal.count
-        away = (motions[i] - trial.motion) / trial.motion_sigma
-        own_h = h[:m2, :m2] + np.diag(1 / trial.motion_sigma**2)
-        own_g = g[:m2] + away / trial.motion_sigma
+        away = (motions[i] - problem.guesses[i]) / problem.spreads[i]
+        own_h = h[:m2, :m2] + np.diag(1 / problem.spreads[i] ** 2)
+        own_g = g[:m2] + away / problem.spreads[i]
         own.append((own_h, h[:m2, m2:], own_g))
         shared_h += h[m2:, m2:]
         shared_g += g[m2:]
@@ -160,15 +178,16 @@ def simulate_sensitive(
 ) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
     """One trial: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
 
-    Columns: the trial's own initial motion, then the shared values (not coordinates).
+    Columns: what the trial has of its own, then the shared values (not coordinates).
     """
     trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
     p = problem.vectors[i]
     p[problem.places[i]] = values
+    m2 = len(motion) - len(problem.own)
+    p[problem.own_places[i]] = own_values(problem.own, motion)
     n = int(np.searchsorted(trial.time, horizon, side='right'))
-    x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)
-    m2 = len(motion)
-    s0 = np.zeros((compiled.nx, m2 + len(values)))
+    x0, by_motion, by_free = compiled.initial_sensitivity(motion[:m2], u[0], p)
+    s0 = np.zeros((compiled.nx, len(motion) + len(values)))
     s0[:, :m2] = by_motion
     for f, column in enumerate(problem.columns[i]):
         if column >= 0:
@@ -178,6 +197,12 @@ def simulate_sensitive(
         keep=keep,
     )  # fmt: skip
     return n, normal, y, jacobian
+
+
+def own_values(own: Sequence[Unknown], motion: np.ndarray) -> np.ndarray:
+    """Of what a trial has of its own, the values behind the initial motion, within range."""
+    values = motion[len(motion) - len(own) :]
+    return np.clip(values, [u.lower for u in own], [u.upper for u in own])
 
 
 def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]:

@@ -9,8 +9,12 @@ SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
 
 def uncertainty(
     problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of the coordinates and the share of each that comes from data: theory.md, (COV).
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """How sure the values are: theory.md, (COV).
+
+    Returns:
+        Covariance of the coordinates (k, k), the share of each that comes from data (k,), and
+        the standard deviations of each trial's own values behind its initial motion.
 
     Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
     right for white residuals, and the sandwich of scores summed over blocks longer than their
@@ -18,14 +22,17 @@ def uncertainty(
     """
     point = evaluate(problem, theta, motions, horizon, weight)
     k = len(theta)
-    if not k or point is None:
-        return np.zeros((k, k)), np.zeros(k)
+    if point is None:
+        return np.zeros((k, k)), np.zeros(k), tuple(np.zeros(len(problem.own)) for _ in motions)
+    excess = max(1.0, point.sse.sum() / point.count.sum())
+    rescale = 1 / (excess * weight)
+    if not k:
+        none = np.zeros((0, 0))
+        return none, np.zeros(0), _own_sigmas(problem, point, none, rescale)
     belief = np.array(
         [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in problem.unknowns]
     )
     h, _, _ = reduced(point, 0.0)
-    excess = max(1.0, point.sse.sum() / point.count.sum())
-    rescale = 1 / (excess * weight)
     h = (h - np.diag(belief)) * rescale + np.diag(belief)
     inverse, lost = _inverse(h)
     scores = _block_scores(problem, theta, motions, horizon, point, weight) * rescale
@@ -36,7 +43,23 @@ def uncertainty(
     certain = np.where(belief > 0, np.diag(covariance), 0.0)
     information = 1 - np.clip(certain * belief, 0, 1)
     information[lost] = 0.0
-    return covariance, information
+    return covariance, information, _own_sigmas(problem, point, covariance, rescale)
+
+
+def _own_sigmas(
+    problem: Problem, point: Point, covariance: np.ndarray, rescale: float
+) -> tuple[np.ndarray, ...]:
+    """Standard deviation of each trial's own values, what is shared being uncertain too."""
+    count = len(problem.own)
+    if not count:
+        return tuple(np.zeros(0) for _ in point.own)
+    found = []
+    shared = np.where(np.isfinite(covariance), covariance, 0.0)
+    for own, cross, _ in point.own:
+        moved = np.linalg.solve(own, cross)
+        spread = np.linalg.inv(own) / rescale + moved @ shared @ moved.T
+        found.append(np.sqrt(np.diag(spread)[-count:]))
+    return tuple(found)
 
 
 def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

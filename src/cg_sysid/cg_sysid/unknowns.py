@@ -8,6 +8,7 @@ import numpy as np
 from cg_dynamics.model import Model
 
 RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
+OWN_SPREAD = 100.0  # scales by which a record's own value may lie from its first guess
 
 
 class IdentificationError(ValueError):
@@ -65,7 +66,7 @@ def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknow
     found = []
     for name, parameter in declared.items():
         q = model.quantities[name]
-        if (only is None and (q.fixed or not parameter.free)) or (
+        if parameter.each or (only is None and (q.fixed or not parameter.free)) or (
             only is not None and name not in only
         ):
             continue
@@ -84,3 +85,23 @@ def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknow
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def own_unknowns(model: Model) -> tuple[Unknown, ...]:
+    """The parameters of which every record has a value of its own, such as a push's instant."""
+    return tuple(
+        Unknown(
+            name, p.unit, model.values[name], OWN_SPREAD * p.scale, p.lower, p.upper, False,
+            p.scale,
+        )
+        for name, p in model.declarations.items()
+        if p.each
+    )  # fmt: skip
+
+
+def awake(model: Model) -> Model:
+    """The model with a little of what every record has of its own.
+
+    At its neutral value an effect takes no part in the equations at all.
+    """
+    return model.with_values({u.name: u.scale for u in own_unknowns(model)})

@@ -2,15 +2,24 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, try_candidate
+from cg_sysid.candidates import Task, own_parameters, try_candidate
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+
+
+def _record(machine, k):
+    return rehearse(
+        f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
+        [lambda t: 9.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.15 * t) * t)],
+        4.0, 0.004, k,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -24,19 +33,12 @@ def test_found_from_its_grid_of_starts(model_file, effect, values):
     nominal = Model.load(model_file)
     off = {'c1': 1.06 * nominal.values['c1'], 'c5': 0.92 * nominal.values['c5']}
     machine = nominal.with_values(off).with_effect(effect, **values)
-    records = [
-        rehearse(
-            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
-            [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.15 * t) * t)],
-            4.0, 0.004, k,
-        )
-        for k in range(2)
-    ]  # fmt: skip
+    records = [_record(machine, k) for k in range(2)]
     train, held = prepare(nominal, records)
     outcome = try_candidate(Task(nominal, (effect, None)), [train], [held])
     # Noise alone gives 1, within a few percent at a thousand rows.
     assert outcome.held.normalised_error < 1.2
-    found = {name: outcome.train.model.values[f'{effect}.{name}'] for name in values}
+    found = {name: value for name, (value, _, _) in own_parameters(outcome).items()}
     if 'phase' in found and found['amplitude'] < 0:
         # A sin(x) and -A sin(x + pi) are the same wave.
         found['amplitude'], found['phase'] = -found['amplitude'], found['phase'] + math.pi
@@ -44,3 +46,30 @@ def test_found_from_its_grid_of_starts(model_file, effect, values):
         if name == 'phase':
             found[name] = value + math.remainder(found[name] - value, 2 * math.pi)
         assert found[name] == pytest.approx(value, rel=0.02)
+
+
+def test_every_record_has_its_own_push(model_file):
+    nominal = Model.load(model_file)
+    pushes = {0: (2.0, 1.3), 2: (-1.1, 2.6)}  # record -> N s, s; none in the others
+    records = []
+    for k in range(4):
+        machine = nominal
+        if k in pushes:
+            impulse, instant = pushes[k]
+            machine = machine.with_effect(
+                'external_push', impulse=impulse, instant=instant, duration=0.08
+            )
+        records.append(_record(machine, k))
+    trials = prepare(nominal, records)
+    outcome = try_candidate(Task(nominal, ('external_push', None)), trials[::2], trials[1::2])
+    assert outcome.held.normalised_error < 1.2  # noise alone gives 1
+    for k in range(4):
+        impulse, instant = outcome.events[f'record_{k}']
+        if k in pushes:
+            assert (impulse, instant) == pytest.approx(pushes[k], rel=0.02)
+        else:
+            assert abs(impulse) < 0.02  # N s, a hundredth of a push
+    # A push is no property of the machine: its model does not push.
+    assert outcome.train.model.values['external_push.impulse'] == 0.0
+    sizes = [s[0] for s in outcome.train.own_sigmas]
+    assert np.all(np.array(sizes) < 0.02)

@@ -13,23 +13,24 @@ class ExternalPush(StanceEffect):
 
     F(t) = impulse exp(-((t - instant) / duration)^2 / 2) / (sqrt(2 pi) duration)       (PUSH)
 
-    at the same time in every record: a machine pushes, not a passer-by.
+    A push is an event of a record, not a property of the machine: every record has its own
+    impulse and instant, and most have none.
     """
 
     name = 'external_push'
     summary = (
-        'Something pushes the hip forward once in each record: a smooth pulse of force around '
-        'an instant, with a given impulse.'
+        'Something pushes the hip forward once: a smooth pulse of force around an instant, with '
+        'a given impulse; both are found for each record.'
     )
     contains = ('tether_force',)
     parameters = (
         Parameter(
             'impulse', 'N s', 'integral of the force, positive forward', -200.0, 200.0,
-            neutral=0.0, starts=(0.5,), scale=0.1,
+            neutral=0.0, starts=(0.5,), scale=0.1, each=True,
         ),
         Parameter(
             'instant', 's', 'time of the greatest force from the start of the record', 0.0, 600.0,
-            starts=tuple(0.5 + second for second in range(20)), scale=0.05, swept=True,
+            starts=(0.5,), scale=0.005, each=True,
         ),
         Parameter(
             'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,

@@ -1,0 +1,140 @@
+"""Is an effect earned? The judgement of candidates against the model that they extend.
+
+The conditions and why they are what they are: docs/diagnosis.md, section 4.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_sysid.candidates import Outcome, at_edge, chi2, own_parameters
+from cg_sysid.diagnosis import Candidate, effect_name, per_output
+from cg_sysid.evidence import block_gain, evidence, independent_samples
+from cg_sysid.trial import Trial
+
+MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
+# No model is trusted to describe a machine better than this share of the noise power: rivals whose
+# chi2/N differ by less are not told apart, however many samples say so.
+FIDELITY = 2e-3
+EARNED = 10.0  # nats an effect must gain over the model without it
+MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
+AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
+SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
+FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
+SHORTEST_BLOCK_S = 0.1
+BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
+
+
+@dataclass(frozen=True)
+class Contest:
+    """All candidates on top of one base, judged, best first.
+
+    Attributes:
+        base: What they extend.
+        ranked: Each candidate and the outcome of its fit.
+        independent: Independent samples behind the evidence.
+    """
+
+    base: Outcome
+    ranked: tuple[tuple[Candidate, Outcome], ...]
+    independent: float
+
+    @property
+    def margin(self) -> float:
+        """Evidence in nats by which rivals are not told apart."""
+        return max(MARGIN, FIDELITY * self.independent / 2)
+
+    def winner(self) -> tuple[Candidate, Outcome] | None:
+        """The best candidate that is earned, or a simpler one that it contains."""
+        able = [pair for pair in self.ranked if not pair[0].reason]
+        if not able:
+            return None
+        leader = able[0][0]
+        simpler = [
+            pair
+            for pair in able
+            if effect_name(pair[0].label) in LIBRARY[effect_name(leader.label)].contains
+            and pair[0].evidence > leader.evidence - self.margin
+        ]
+        return simpler[0] if simpler else able[0]
+
+    def of(self, label: str) -> tuple[Candidate, Outcome] | None:
+        """The candidate of that label."""
+        return next((pair for pair in self.ranked if pair[0].label == label), None)
+
+    def close_to(self, label: str) -> list[Candidate]:
+        """Other earned candidates that come within the margin of this one, best first."""
+        found = self.of(label)
+        if found is None:
+            return []
+        least = found[0].evidence - self.margin
+        return [
+            c for c, _ in self.ranked if c.label != label and not c.reason and c.evidence > least
+        ]
+
+
+class Jury:
+    """Judges outcomes that were fitted on one split of records."""
+
+    def __init__(self, train: Sequence[Trial], held: Sequence[Trial]):
+        trials = (*train, *held)
+        self.first_held = len(train)
+        self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
+        judged = sum(trial.duration for trial in held)
+        block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
+        self.rows_per_block = max(1, int(block / np.median(self.steps)))
+
+    def contest(self, base: Outcome, outcomes: Sequence[Outcome]) -> Contest:
+        """Rank outcomes that extend a base."""
+        if not outcomes:
+            return Contest(base, (), 2.0)
+        leader = min([base, *outcomes], key=chi2)
+        independent = independent_samples(leader.residuals, self.steps)
+        reference = _evidence(base, independent)
+        ranked = [
+            (self.judge(base, o, reference - _evidence(o, independent)), o) for o in outcomes
+        ]
+        ranked.sort(key=lambda pair: -pair[0].evidence)
+        return Contest(base, tuple(ranked), independent)
+
+    def judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
+        """One outcome against its base, `gained` nats of evidence better."""
+        n = self.first_held
+        significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
+        before = per_output(base.held)
+        after = per_output(o.held)
+        explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
+        held_gain = 1 - o.held.normalised_error / base.held.normalised_error
+        reasons = []
+        if gained < EARNED:
+            reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
+        if significance < SIGNIFICANT or held_gain <= 0:
+            reasons.append('no significant gain on held-out records')
+        if explained < MATERIAL:
+            reasons.append(f'explains {explained:.2f} noise standard deviations, '
+                           f'{MATERIAL:g} needed')
+        reasons += at_edge(o)
+        return Candidate(
+            label=o.label,
+            model=o.train.model,
+            train=o.train,
+            held=o.held,
+            evidence=float(gained),
+            held_gain=float(held_gain),
+            significance=significance,
+            explained=explained,
+            parameters=own_parameters(o),
+            reason='; '.join(reasons),
+        )
+
+
+def at_noise(o: Outcome) -> bool:
+    """True if every output is simulated down to noise, in training and on records held out."""
+    return bool((per_output(o.train) < AT_NOISE).all() and (per_output(o.held) < AT_NOISE).all())
+
+
+def _evidence(o: Outcome, independent: float) -> float:
+    samples = o.train.count.sum() + o.held.count.sum()
+    return evidence(chi2(o), samples, independent, o.unknowns, o.belief)
