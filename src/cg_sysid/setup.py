@@ -40,7 +40,7 @@ setup(
         'scipy',
         'zstandard',
     ],
-    extras_require={'test': ['pytest', 'pytest-timeout']},
+    extras_require={'cluster': ['distributed'], 'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
     entry_points={
         'console_scripts': [

@@ -10,6 +10,7 @@ import argparse
 import fnmatch
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from rich.console import Console
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
+from cg_sysid.cluster import Cluster
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Diagnosis, Options
 from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
@@ -61,6 +63,10 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('--workers', type=int, help='local processes [one per core]')
     made.add_argument(
+        '--scheduler', metavar='ADDRESS',
+        help='fit on the workers of this dask scheduler instead, such as tcp://127.0.0.1:8786',
+    )  # fmt: skip
+    made.add_argument(
         '--held', '--hold-out', metavar='GLOB',
         help="records to judge on, by name, such as 'spring*_2' [every second of each set-up]",
     )  # fmt: skip
@@ -78,12 +84,15 @@ def work(options: argparse.Namespace) -> int:
         raise ValueError(f'--rounds is {options.rounds}; at least 1 is needed')
     if options.workers is not None and options.workers < 0:
         raise ValueError(f'--workers is {options.workers}; it must not be negative')
+    if options.scheduler is not None and options.workers is not None:
+        raise ValueError('--workers are local processes; leave it out where --scheduler is given')
     if options.out.is_file():
         raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
     model = Model.load(options.model)
     effects = _effects(options.effects, model)
     note = cli.load_note(options.note)
-    with cli.Bars(options.quiet) as bars:
+    fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
+    with fitters as executor, cli.Bars(options.quiet) as bars:
         intake = take_in(
             options.bags, options.model, note, options.torque, options.window, bars
         )
@@ -103,7 +112,7 @@ def work(options: argparse.Namespace) -> int:
             answer = None
         else:
             answer = diagnose(
-                model, intake.records, _options(options, effects, intake), bars
+                model, intake.records, _options(options, effects, intake), bars, executor
             )
             lines = diagnosis_curves(answer)
             facts = diagnosis_facts(answer, intake, origin, lines)
@@ -122,6 +131,7 @@ def _command(options: argparse.Namespace) -> list[str]:
     for name, value in (
         ('--effects', options.effects), ('--held', options.held), ('--window', options.window),
         ('--note', options.note), ('--input', options.torque), ('--workers', options.workers),
+        ('--scheduler', options.scheduler),
     ):  # fmt: skip
         words += [] if value is None else [name, str(value)]
     if options.rounds != Options.rounds:
