@@ -13,10 +13,12 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.events import seek_events
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
+from cg_sysid.imperfections import Bounds
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
+FIRST_ITERATIONS = 16  # of a first fit to whole records; most have converged by then
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 MOST_STARTS = 24
 FOLLOWED = 3  # starts of a swept parameter that are worth a second look
@@ -35,11 +37,15 @@ class Task:
         effect: Effect and place.
         events: What happened in each trial alone, as far as the base knows it: name of the trial
             -> own values (unknowns.own_unknowns).
+        bounds: Small faults that the base may have (imperfections.py).
+        so_far: Go on from this fit, for as long as it takes; without one a first, short fit.
     """
 
     model: Model
     effect: tuple[str, str | None] | None = None
     events: Mapping[str, np.ndarray] = field(default_factory=dict)
+    bounds: Bounds = field(default_factory=dict)
+    so_far: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -63,14 +69,16 @@ def candidates_for(
     setups: Sequence[Setup],
     names: Sequence[str] | None = None,
     recorded: Collection[str] = (),
+    small: Collection[str] = (),
 ) -> list[tuple[str, str | None]]:
     """(effect, at) of all that could show in these set-ups and that the model does not have.
 
+    What the model has as a small fault (labels in `small`) can still be a cause, as a large one.
     An effect that needs a switch (`drive_enabled`) is tried only where that was recorded: with
     the switch always on it would be another name for a simpler effect.
     """
     known = {*model.mechanism.inputs, TIME, *recorded}
-    present = {effect.label for effect in model.effects}
+    present = {effect.label for effect in model.effects}.difference(small)
     found = []
     for name, effect in LIBRARY.items():
         if not effect.applies(setups) or not known.issuperset(effect.extra_inputs):
@@ -104,6 +112,10 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     Returns:
         The outcome, or a sentence saying why there is none.
     """
+    label = _label(task)
+    # A small fault that is tried as a cause is no longer bound to be small.
+    bounds = {n: b for n, b in task.bounds.items() if not n.startswith(f'{label}.')}
+    task = replace(task, bounds=bounds)
     try:
         best = _best_fit(task, train)
         events = _events_of(best, train)
@@ -112,7 +124,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
             events |= known or seek_events(best.model, held, _surest(best))
         held_score = score(best.model, held, own=events)
         events |= _events_of(held_score, held)
-        model = believing(best.model, task.model)
+        model = believing(best.model, task.model, label)
         residuals = tuple(
             (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
             for trial, motion in zip(
@@ -126,10 +138,10 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         for u, v in zip(best.unknowns, best.values, strict=True)
         if np.isfinite(u.tolerance)
     )
-    label = best.model.effects[-1].label if task.effect else task.model.name
     return Outcome(
         task, label, model, best, held_score, residuals, belief,
-        len(best.unknowns) + len(best.own) * (len(train) + len(held)), events,
+        # Small faults cost nothing: every robot has them.
+        len(best.unknowns) - len(bounds) + len(best.own) * (len(train) + len(held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),
     )  # fmt: skip
 
@@ -154,39 +166,53 @@ def _surest(found: Fit) -> list[np.ndarray]:
     return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
 
 
+def cost_of(effect: tuple[str, str | None]) -> int:
+    """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
+    kind = LIBRARY[effect[0]]
+    events = any(p.each for p in kind.parameters)
+    swept = any(p.swept for p in kind.parameters)
+    return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(effect[0]))
+
+
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     if own_unknowns(task.model) == () != own_unknowns(next(_starting_models(task))):
         return _event_fit(task, train)
+    if task.so_far is not None:
+        model = next(_starting_models(task))
+        return fit(model, train, start=task.so_far, bounds=task.bounds)
     # A short horizon tells which start is worth going on from, on the way to the full one.
     models = list(_starting_models(task))
     if len(models) == 1:
-        return fit(models[0], train, own=task.events)
+        return fit(models[0], train, own=task.events, bounds=task.bounds)
     kept = _swept(models[0])
-    looks = _looks(models, train, kept, task.events)
+    looks = _looks(task, models, train, kept)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
-        looks = _looks([model for _, model in looks[:FOLLOWED]], train, [], task.events)
+        looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
     look, _ = looks[0]
-    return fit(models[0], train, start=look)
+    return fit(models[0], train, start=look, bounds=task.bounds, iterations=FIRST_ITERATIONS)
 
 
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     """An effect of which every record has its own size and instant."""
-    settled = fit(task.model, train)
+    settled = task.so_far or fit(task.model, train, bounds=task.bounds)
     nothing = settled.normalised_error
-    best: Fit | None = None
-    for _ in range(SEEKINGS):
+    best = task.so_far
+    for _ in range(SEEKINGS if best else 1):
         # What was a push is at first taken for other parameters: seek again when it is not.
         at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
         model = next(_starting_models(task))
         events = seek_events(model.with_values(at), train)
-        settled = fit(model, train, at=at, own=events)
+        settled = fit(
+            model, train, at=at, own=events, bounds=task.bounds, iterations=FIRST_ITERATIONS
+        )
         if best is None or settled.normalised_error < best.normalised_error:
             best = settled
-        if best.normalised_error > WORTH_SEEKING * nothing or best.normalised_error < SETTLED:
-            break
+        if best.normalised_error < SETTLED:
+            return best
     assert best is not None
-    return best
+    found = bool(task.so_far) or best.normalised_error > WORTH_SEEKING * nothing
+    return replace(best, converged=found)
 
 
 def _swept(model: Model) -> list[str]:
@@ -196,19 +222,18 @@ def _swept(model: Model) -> list[str]:
 
 
 def _looks(
-    models: Sequence[Model],
-    train: Sequence[Trial],
-    kept: Sequence[str],
-    events: Mapping[str, np.ndarray],
+    task: Task, models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str]
 ) -> list[tuple[Fit, Model]]:
     """Short fits from each model and where they lead, best first; `kept` stay as they are."""
     looks = []
     for model in models:
-        only = [u.name for u in unknowns_of(model) if u.name not in kept] if kept else None
+        moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
+        only = [name for name in moved if name not in kept] if kept else None
         try:
             look = fit(
-                model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS, own=events
-            )
+                model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS,
+                own=task.events, bounds=task.bounds,
+            )  # fmt: skip
             found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
             looks.append((look, model.with_values(found)))
         except IdentificationError as error:
@@ -223,17 +248,27 @@ def _starting_models(task: Task):
         yield task.model
         return
     name, at = task.effect
+    label = _label(task)
+    small = any(effect.label == label for effect in task.model.effects)
+    base = task.model.without_effect(label) if small else task.model
     for start in starts_of(name):
-        yield task.model.with_effect(name, at, **start)
+        yield base.with_effect(name, at, **start)
 
 
-def believing(fitted: Model, base: Model) -> Model:
+def _label(task: Task) -> str:
+    if task.effect is None:
+        return task.model.name
+    name, at = task.effect
+    return LIBRARY[name](task.model.mechanism, at).label
+
+
+def believing(fitted: Model, base: Model, label: str) -> Model:
     """The fitted structure with the base's numbers and beliefs; added effects keep their values.
 
     What a fit found is a start for the next one, not a belief.
     """
     added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
-             if n not in base.quantities}
+             if n not in base.quantities or n.startswith(f'{label}.')}
     return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
 
 

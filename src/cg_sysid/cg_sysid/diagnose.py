@@ -14,13 +14,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
+import numpy as np
+
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
 from cg_sysid.candidates import (
     Outcome,
     Task,
     candidates_for,
     chi2,
+    cost_of,
     events_of,
     parameters_of,
     try_candidate,
@@ -35,7 +39,8 @@ from cg_sysid.diagnosis import (
     per_output,
     summary_of,
 )
-from cg_sysid.jury import MATERIAL, Contest, Jury, at_noise
+from cg_sysid.imperfections import imperfect, with_imperfections
+from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise
 from cg_sysid.parallel import run_all
 from cg_sysid.record import Record
 from cg_sysid.trial import Trial, prepare
@@ -43,7 +48,11 @@ from cg_sysid.unknowns import IdentificationError
 
 log = logging.getLogger(__name__)
 
+LEAD_IN_S = 0.1  # of each record, not judged
+LEAD_IN_SHARE = 0.05  # of a short record
 REVIEWS = 4  # passes of doubt over what was accepted
+SHOWS = 3.0  # standard deviations from which a small fault is there at all
+IN_REACH = 10.0  # times the smallest error, from which a fit that has not converged may win
 Progress = Callable[[str, int, int], None]
 
 
@@ -111,9 +120,20 @@ def diagnose(
         IdentificationError: if the records cannot be used with this model.
     """
     options = options or Options()
-    train, held = split(prepare(model, records), options.held)
+    trials = [_led_in(trial) for trial in prepare(model, records)]
+    train, held = split(trials, options.held)
     search = _Search(model, train, held, options, progress or (lambda *_: None), executor)
     return search.run()
+
+
+def _led_in(trial: Trial) -> Trial:
+    """The trial less the outputs of its first moments.
+
+    What went before a record is an assumption of every model with a memory, as a delay; it must
+    not count for or against the model.
+    """
+    begun = trial.time >= min(LEAD_IN_S, LEAD_IN_SHARE * trial.duration)
+    return replace(trial, outputs=np.where(begun[:, None], trial.outputs, np.nan))
 
 
 class _Search:
@@ -140,17 +160,20 @@ class _Search:
             if self._added(final) in seen:
                 break
             seen.add(self._added(final))
-        return self._conclude(base, final)
+        return self._conclude(base, self._less_small_faults(final))
 
     def _added(self, o: Outcome) -> frozenset[str]:
-        """Labels of the effects that were put on top of the nominal model."""
-        return frozenset(
-            effect.label for effect in o.model.effects
-        ) - {effect.label for effect in self.nominal.effects}
+        """Labels of the effects that were put on top of the nominal model, less small faults."""
+        stated = {effect.label for effect in self.nominal.effects}
+        small = imperfect(o.model, o.task.bounds)
+        return frozenset(effect.label for effect in o.model.effects) - stated - small
 
     def _extend(self, o: Outcome) -> Outcome:
         """Accept one effect after the other, until nothing more is earned."""
-        while len(self._added(o)) < self.options.rounds and not at_noise(o):
+        while len(self._added(o)) < self.options.rounds:
+            o = self._with_small_faults(o)
+            if at_noise(o):
+                break
             contest = self._contest(o)
             winner = contest.winner()
             self._note(contest, winner[0].label if winner else '')
@@ -158,6 +181,41 @@ class _Search:
                 break
             o = winner[1]
         return o
+
+    def _with_small_faults(self, o: Outcome) -> Outcome:
+        """The same with what every robot has a little of, if that explains anything."""
+        if at_noise(o) or o.task.bounds:
+            return o
+        model, bounds = with_imperfections(o.model, self._setups())
+        title = f'{self._title(self._added(o))}, with small faults'
+        found = self._fit([Task(model, events=o.events, bounds=bounds)], title)[0]
+        if isinstance(found, str):
+            log.info('small faults: %s', found)
+            return o
+        contest = self.jury.contest(o, [found])
+        return found if contest.ranked[0][0].evidence > EARNED else o
+
+    def _less_small_faults(self, final: Outcome) -> Outcome:
+        """Without those small faults that, beside the causes, explain nothing any more."""
+        small = imperfect(final.model, final.task.bounds)
+        idle = [label for label in sorted(small) if not _shows(final, label)]
+        for gone in (sorted(small), idle):
+            if not gone:
+                continue
+            model, bounds = final.model, dict(final.task.bounds)
+            for label in gone:
+                model = model.without_effect(label)
+                bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
+            task = Task(model, events=final.events, bounds=bounds)
+            lean = self._fit([task], 'without small faults')[0]
+            if isinstance(lean, str):
+                continue
+            if self.jury.contest(lean, [final]).ranked[0][0].evidence < EARNED:
+                return lean
+        return final
+
+    def _setups(self) -> list[Setup]:
+        return [trial.setup for trial in (*self.train, *self.held)]
 
     def _exchange(self, nominal: Outcome, final: Outcome) -> Outcome | None:
         """A better structure: without an effect that is not earned, or with another instead.
@@ -183,7 +241,12 @@ class _Search:
         """The library in competition for the place of one of several effects."""
         others = self._added(final) - {label}
         if others not in self.contests:
-            task = Task(final.model.without_effect(label), events=final.events)
+            bounds = final.task.bounds
+            model = final.model.without_effect(label)
+            if bounds:
+                model, missing = with_imperfections(model, self._setups())
+                bounds = {**bounds, **missing}
+            task = Task(model, events=final.events, bounds=bounds)
             lean = self._fit([task], f'model without {label}')[0] if others else nominal
             if isinstance(lean, str):
                 log.info('without %s: %s', label, lean)
@@ -201,17 +264,36 @@ class _Search:
     def _contest(self, base: Outcome) -> Contest:
         added = self._added(base)
         if added not in self.contests:
-            setups = [trial.setup for trial in (*self.train, *self.held)]
             recorded = {name for trial in self.train for name in trial.input_names}
-            effects = candidates_for(base.model, setups, self.options.effects, recorded)
-            tasks = [Task(base.model, effect, base.events) for effect in effects]
-            outcomes = self._fit(tasks, f'effects on top of {self._title(added)}')
-            for task, outcome in zip(tasks, outcomes, strict=True):
+            bounds = base.task.bounds
+            effects = candidates_for(
+                base.model, self._setups(), self.options.effects, recorded,
+                imperfect(base.model, bounds),
+            )  # fmt: skip
+            # The longest first, or the last of them would be waited for.
+            effects.sort(key=cost_of, reverse=True)
+            tasks = [Task(base.model, effect, base.events, bounds) for effect in effects]
+            outcomes = self._fit_all(tasks, f'effects on top of {self._title(added)}')
+            self.contests[added] = self.jury.contest(base, outcomes)
+        return self.contests[added]
+
+    def _fit_all(self, tasks: list[Task], what: str) -> list[Outcome]:
+        """Fit candidates, those that may still win for as long as it takes."""
+        found: dict[str, Outcome] = {}
+        while tasks:
+            for task, outcome in zip(tasks, self._fit(tasks, what), strict=True):
                 if isinstance(outcome, str):
                     log.info('%s: %s', task.effect, outcome)
-            good = [o for o in outcomes if isinstance(o, Outcome)]
-            self.contests[added] = self.jury.contest(base, good)
-        return self.contests[added]
+                elif outcome.label not in found or chi2(outcome) < chi2(found[outcome.label]):
+                    found[outcome.label] = outcome
+            best = min((chi2(o) for o in found.values()), default=0.0)
+            tasks = [
+                replace(o.task, so_far=o.train)
+                for o in found.values()
+                if not o.train.converged and o.task.so_far is None and chi2(o) < IN_REACH * best
+            ]
+            what = f'{what}, in more depth'
+        return list(found.values())
 
     def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
         return run_all(
@@ -271,6 +353,12 @@ class _Search:
             remaining={c: float(v) for c, v in remaining.items()},
             findings=tuple(final.train.warnings),
         )
+
+
+def _shows(o: Outcome, label: str) -> bool:
+    """True if a small fault is larger than its uncertainty."""
+    value, sigma, _ = next(iter(parameters_of(o, label).values()))
+    return abs(value) > SHOWS * sigma
 
 
 def _cause(final: Outcome, label: str, contest: Contest) -> Cause:

@@ -13,7 +13,7 @@ parameters far outside what the model file believes.
 """
 
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,6 +102,7 @@ def fit(
     start: Fit | None = None,
     at: Mapping[str, float] | None = None,
     own: Mapping[str, np.ndarray] | None = None,
+    bounds: Mapping[str, float] | None = None,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -116,6 +117,7 @@ def fit(
         at: Set out from these values (full name -> value) instead of those of the file.
         own: Name of a trial -> first guess of what it has of its own beyond its initial motion
             (`own_unknowns`); without one the model's values are the guess.
+        bounds: Parameters that stay near the model's value (`unknowns_of`).
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -123,7 +125,7 @@ def fit(
     if not trials:
         raise IdentificationError('no record to identify from; at least one is needed')
     began = clock.perf_counter()
-    unknowns = unknowns_of(model, only)
+    unknowns = unknowns_of(model, only, bounds)
     problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}))
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
@@ -173,7 +175,7 @@ def fit(
         seconds=clock.perf_counter() - began,
         converged=converged,
     )
-    return replace(result, warnings=tuple(_warnings(result)))
+    return replace(result, warnings=tuple(_warnings(result, bounds or ())))
 
 
 def _guesses(
@@ -294,11 +296,13 @@ def _with_uncertainty(
     return replace(model, quantities=quantities)
 
 
-def _warnings(fit: Fit):
+def _warnings(fit: Fit, bounds: Collection[str]):
     sigmas = fit.sigmas
     for u, value, sigma, share in zip(
         fit.unknowns, fit.values, sigmas, fit.information, strict=True
     ):
+        if u.name in bounds:
+            continue  # the bound is a statement, not a finding
         span = u.upper - u.lower
         if min(value - u.lower, u.upper - value) <= 1e-6 * span:
             yield f'{u.name} = {value:.4g} {u.unit} lies at the edge of its range'

@@ -15,9 +15,12 @@ from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.trial import Trial
 
 MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
-# No model is trusted to describe a machine better than this share of the noise power: rivals whose
-# chi2/N differ by less are not told apart, however many samples say so.
-FIDELITY = 2e-3
+# Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
+# so: it is the order of what integrators and interpolation differ by.
+FIDELITY = 3e-4
+# A model that leaves more than white noise has something wrong, and small differences say less.
+ROUGH_FIDELITY = 2e-3
+WHITE = 0.9  # share of independent samples from which a residual counts as white noise
 EARNED = 10.0  # nats an effect must gain over the model without it
 MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
 AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
@@ -35,16 +38,13 @@ class Contest:
         base: What they extend.
         ranked: Each candidate and the outcome of its fit.
         independent: Independent samples behind the evidence.
+        margin: Evidence in nats by which rivals are not told apart.
     """
 
     base: Outcome
     ranked: tuple[tuple[Candidate, Outcome], ...]
     independent: float
-
-    @property
-    def margin(self) -> float:
-        """Evidence in nats by which rivals are not told apart."""
-        return max(MARGIN, FIDELITY * self.independent / 2)
+    margin: float
 
     def winner(self) -> tuple[Candidate, Outcome] | None:
         """The best candidate that is earned, or a simpler one that it contains."""
@@ -89,7 +89,7 @@ class Jury:
     def contest(self, base: Outcome, outcomes: Sequence[Outcome]) -> Contest:
         """Rank outcomes that extend a base."""
         if not outcomes:
-            return Contest(base, (), 2.0)
+            return Contest(base, (), 2.0, MARGIN)
         leader = min([base, *outcomes], key=chi2)
         independent = independent_samples(leader.residuals, self.steps)
         reference = _evidence(base, independent)
@@ -97,7 +97,10 @@ class Jury:
             (self.judge(base, o, reference - _evidence(o, independent)), o) for o in outcomes
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
-        return Contest(base, tuple(ranked), independent)
+        white = independent > WHITE * _samples(leader)
+        fidelity = FIDELITY if white else ROUGH_FIDELITY
+        margin = max(MARGIN, fidelity * independent / 2)
+        return Contest(base, tuple(ranked), independent, margin)
 
     def judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
         """One outcome against its base, `gained` nats of evidence better."""
@@ -135,6 +138,9 @@ def at_noise(o: Outcome) -> bool:
     return bool((per_output(o.train) < AT_NOISE).all() and (per_output(o.held) < AT_NOISE).all())
 
 
+def _samples(o: Outcome) -> float:
+    return float(o.train.count.sum() + o.held.count.sum())
+
+
 def _evidence(o: Outcome, independent: float) -> float:
-    samples = o.train.count.sum() + o.held.count.sum()
-    return evidence(chi2(o), samples, independent, o.unknowns, o.belief)
+    return evidence(chi2(o), _samples(o), independent, o.unknowns, o.belief)

@@ -17,6 +17,8 @@ from cg_dynamics.rig import Setup
 from cg_sysid.noise import measure_noise
 from cg_sysid.record import Record
 
+LATEST = 0.02  # s by which sensors may report late
+FASTEST = 50.0  # rad/s^2, acceleration of a lively start
 START_WINDOW = 0.03  # s of data behind the first guess of the initial motion
 # A floor below the noise that is stated or measured would let rounding decide.
 SMALLEST_SIGMA = {'rad': 1e-6, 'rad/s': 1e-5}
@@ -111,7 +113,7 @@ def _trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     outputs = np.column_stack(
         [record.outputs.get(channel, np.full(len(time), np.nan)) for channel in body.outputs]
     )
-    motion, motion_sigma = _initial_motion(body, record.setup, time, outputs, sigma)
+    motion, motion_sigma = initial_motion(body, record.setup, time, outputs, sigma)
     return Trial(
         name=record.name,
         time=time,
@@ -136,9 +138,10 @@ def sensor_matrix(body: Mechanism, setup: Setup) -> np.ndarray:
     return np.asarray(ca.DM(jacobian(np.zeros(m), np.zeros(m))))
 
 
-def _initial_motion(
+def initial_motion(
     body: Mechanism, setup: Setup, time: np.ndarray, outputs: np.ndarray, sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """First guess of free coordinates and rates at the first row, and how far it may be off."""
     # Value and slope of each channel over a short window, then least squares on (s, ds/dt):
     # the slope of an angle is a rate, so encoders alone give rates too.
     matrix = sensor_matrix(body, setup)
@@ -166,6 +169,7 @@ def _initial_motion(
     motion, *_ = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)
     information = (a * w[:, None]).T @ (a * w[:, None])
     spread = np.sqrt(np.diag(np.linalg.pinv(information)))
-    # The window's polynomial is itself an approximation: be generous.
-    return motion, 10 * spread + np.concatenate([np.full(m, 1e-3), np.full(m, 1e-1)])
+    # The window's polynomial is itself an approximation, and the sensors may be late: be generous.
+    late = LATEST * np.concatenate([np.abs(motion[m:]), np.full(m, FASTEST)])
+    return motion, 10 * spread + late + np.concatenate([np.full(m, 1e-3), np.full(m, 1e-1)])
 

@@ -1,11 +1,12 @@
 """What an identification moves: parameters, what is believed of them, and in which coordinate."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cg_dynamics.model import Model
+from cg_dynamics.parameter import Parameter
 
 RELATIVE_TOLERANCE = 0.15  # of a value whose file states no tolerance
 OWN_SPREAD = 100.0  # scales by which a record's own value may lie from its first guess
@@ -50,8 +51,16 @@ class Unknown:
         return min(max(value, self.lower), self.upper)
 
 
-def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknown, ...]:
+def unknowns_of(
+    model: Model, only: Sequence[str] | None = None, bounds: Mapping[str, float] | None = None
+) -> tuple[Unknown, ...]:
     """The parameters of a model that identification moves: declared free, not fixed in the file.
+
+    Args:
+        model: The model.
+        only: Full names of those to move instead.
+        bounds: Parameters that move by so much at most, free or not: full name -> largest
+            distance from the model's value, in the coordinate in which it is moved.
 
     Raises:
         IdentificationError: if `only` names something that the model does not have.
@@ -64,13 +73,16 @@ def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknow
                     f'no parameter {name!r} to identify; there are: {", ".join(declared)}'
                 )
     found = []
+    bounds = bounds or {}
     for name, parameter in declared.items():
         q = model.quantities[name]
-        if parameter.each or (only is None and (q.fixed or not parameter.free)) or (
-            only is not None and name not in only
-        ):
+        moved = not (q.fixed or not parameter.free) or name in bounds
+        if parameter.each or not (moved if only is None else name in only):
             continue
         if not np.isfinite(q.value):
+            continue
+        if name in bounds:
+            found.append(_bounded(name, parameter, q.value, bounds[name]))
             continue
         tolerance = q.tolerance
         if tolerance is None:
@@ -85,6 +97,17 @@ def unknowns_of(model: Model, only: Sequence[str] | None = None) -> tuple[Unknow
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def _bounded(name: str, parameter: Parameter, value: float, bound: float) -> Unknown:
+    if parameter.logarithmic:
+        lower, upper = value * np.exp(-bound), value * np.exp(bound)
+    else:
+        lower, upper = value - bound, value + bound
+    return Unknown(
+        name, parameter.unit, value, bound, max(lower, parameter.lower),
+        min(upper, parameter.upper), parameter.logarithmic, parameter.scale,
+    )  # fmt: skip
 
 
 def own_unknowns(model: Model) -> tuple[Unknown, ...]:

@@ -1,0 +1,58 @@
+"""What every real robot has a little of, and no diagnosis should cry about.
+
+A delay of half a sample, an encoder zeroed to the width of a line, springs stiff to a per cent:
+such small faults leave a simulation error many times the noise, and taken for the absence of
+physics they would have any cause that happens to look like them. So they may explain an error
+first, each within the bounds of a sound robot. What goes beyond is for a cause to explain.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import log
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+# Effect -> parameter and its largest size in a sound robot, in the unit of the parameter.
+SOUND = {
+    'actuator_delay': ('delay', 1.2e-3),
+    'encoder_offset': ('offset', 6e-4),
+    'imu_offset': ('offset', 2e-3),
+    'spring_stiffness': ('error', 0.015),
+}
+# The rate over which dry friction turns is a device of computation, good to a factor at best.
+SMOOTHING = ('transition_rate', log(2.5))
+NEXT_TO_NOTHING = 1e-3  # of the largest size: at its neutral value an effect takes no part
+
+Bounds = Mapping[str, float]
+
+
+def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bounds]:
+    """The model with the small faults that it does not state, and how large each may be.
+
+    Returns:
+        The model, and full name of a parameter -> largest distance from its value there, in the
+        coordinate in which it is identified.
+    """
+    present = {effect.label for effect in model.effects}
+    bounds = {}
+    for effect in model.effects:
+        for declared in effect.parameters:
+            if declared.name == SMOOTHING[0]:
+                bounds[f'{effect.label}.{declared.name}'] = SMOOTHING[1]
+    for name, (parameter, largest) in SOUND.items():
+        kind = LIBRARY[name]
+        if not kind.applies(setups):
+            continue
+        for site in kind.sites(model.mechanism):
+            label = kind(model.mechanism, site).label
+            if label not in present:
+                model = model.with_effect(name, site, **{parameter: NEXT_TO_NOTHING * largest})
+                bounds[f'{label}.{parameter}'] = largest
+    return model, bounds
+
+
+def imperfect(model: Model, bounds: Bounds) -> set[str]:
+    """Labels of the effects of a model that are small faults."""
+    names = {name.rpartition('.')[0] for name in bounds if not name.endswith(SMOOTHING[0])}
+    return {effect.label for effect in model.effects} & names
