@@ -20,13 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_bringup.experiments import NOMINAL_MODEL, load_experiment
 from cg_bringup.hidden import hide, hideable_effects, perturb
+from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import load_experiment
 from cg_sysid.rehearse import rehearse
 
 PROGRAMME = (

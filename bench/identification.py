@@ -17,14 +17,15 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares, minimize
 
-from cg_bringup.experiments import NOMINAL_MODEL, load_experiment
 from cg_bringup.hidden import perturb
+from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import load_experiment
 from cg_sysid.identify import fit
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare

@@ -21,9 +21,10 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Imu, JointState
 
 from cg_bringup.experiment import run_experiment
-from cg_bringup.experiments import Run, load_experiment
+from cg_bringup.runs import Run
 from cg_dynamics.domains import own_domain
 from cg_dynamics.ros import SENSOR_QOS, to_stamp
+from cg_sysid.experiments import load_experiment
 from cg_sysid.recover import recover
 
 PERIOD = 0.002  # s

@@ -19,11 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 from cg_bringup.experiment import run_experiment
-from cg_bringup.experiments import NOMINAL_MODEL, ExperimentError, Run, load_experiment
 from cg_bringup.hidden import Hidden, hide
+from cg_bringup.runs import NOMINAL_MODEL, Run
 from cg_description.paths import model_path
 from cg_dynamics.domains import own_domain
 from cg_dynamics.model import Model
+from cg_sysid.experiments import ExperimentError, load_experiment
 
 # The last repeats the first with another excitation.
 PROGRAMME = (

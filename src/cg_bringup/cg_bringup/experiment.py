@@ -17,16 +17,8 @@ from pathlib import Path
 
 import yaml
 
-from cg_bringup.experiments import (
-    MODES,
-    NODE_MODULES,
-    ExperimentError,
-    Run,
-    experiment_names,
-    load_experiment,
-    node_parameters,
-    parameter_file_text,
-)
+from cg_bringup.runs import MODES, NODE_MODULES, Run, node_parameters, parameter_file_text
+from cg_sysid.experiments import ExperimentError, experiment_names, load_experiment
 
 RATE_HZ = 500.0
 START_UP = 60.0  # s that processes and discovery may take on a busy machine

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from cg_bringup.experiments import ExperimentError, experiments_directory
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import ModelError
 from cg_dynamics.model import Model
+from cg_sysid.experiments import ExperimentError
 
 DRAWS = 200  # attempts to perturb the lumps such that real bodies can have them
 
@@ -39,7 +39,10 @@ class Hidden:
 
 def hidden_effects_file() -> Path:
     """The file of effects and magnitudes to draw from."""
-    return experiments_directory().parent / 'hidden_effects.yaml'
+    package = Path(__file__).resolve().parent
+    beside = package.parent / 'config' / 'hidden_effects.yaml'
+    shared = (p / 'share' / 'cg_bringup' / 'config' / beside.name for p in package.parents)
+    return next((path for path in (beside, *shared) if path.is_file()), beside)
 
 
 def hideable_effects(nominal: Model) -> list[str]:

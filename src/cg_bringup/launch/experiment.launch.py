@@ -16,15 +16,8 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from cg_bringup.experiments import (
-    MODES,
-    NODE_MODULES,
-    Run,
-    experiment_names,
-    load_experiment,
-    node_parameters,
-    parameter_file_text,
-)
+from cg_bringup.runs import MODES, NODE_MODULES, Run, node_parameters, parameter_file_text
+from cg_sysid.experiments import experiment_names, load_experiment
 
 ARGUMENTS = {
     'experiment': ('spring_stabilised_inner', 'what to carry out', experiment_names()),

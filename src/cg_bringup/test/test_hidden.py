@@ -2,10 +2,10 @@
 
 import pytest
 
-from cg_bringup.experiments import ExperimentError
 from cg_bringup.hidden import hide, hideable_effects
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
+from cg_sysid.experiments import ExperimentError
 
 NOMINAL = Model.load(model_path('compass_gait_mit'))
 

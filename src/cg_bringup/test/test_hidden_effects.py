@@ -9,8 +9,8 @@ bench/hidden_effects.py, and machines simulated by MuJoCo in cg_sysid.
 import numpy as np
 import pytest
 
-from cg_bringup.experiments import NOMINAL_MODEL, load_experiment
 from cg_bringup.hidden import hide, perturb
+from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.bag_writer import write_bag
@@ -18,6 +18,7 @@ from cg_sysid.bags import read_bag
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import load_experiment
 from cg_sysid.rehearse import rehearse
 
 PROGRAMME = (

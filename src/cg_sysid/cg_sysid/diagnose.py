@@ -19,6 +19,7 @@ import numpy as np
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
     Outcome,
     Task,
@@ -51,6 +52,7 @@ log = logging.getLogger(__name__)
 LEAD_IN_S = 0.1  # of each record, not judged
 LEAD_IN_SHARE = 0.05  # of a short record
 REVIEWS = 4  # passes of doubt over what was accepted
+PROPOSED = 3  # experiments named for each cause with rivals
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 IN_REACH = 10.0  # times the smallest error, from which a fit that has not converged may win
 Progress = Callable[[str, int, int], None]
@@ -321,8 +323,22 @@ class _Search:
                 continue
             if len(self._added(final)) > 1:
                 self._note(contest, label)
-            causes.append(_cause(final, label, contest))
+            cause = _cause(final, label, contest)
+            causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
+
+    def _proposals(
+        self, final: Outcome, cause: Cause, contest: Contest
+    ) -> tuple[Proposal, ...]:
+        """Experiments that would tell a cause from its rivals."""
+        if not cause.rivals or not self.options.experiments:
+            return ()
+        found = (contest.of(label) for label in cause.rivals)
+        rivals = [replace(final, label=cause.label), *(pair[1] for pair in found if pair)]
+        return propose(
+            rivals, self.train[0].sigma, self.options.experiments, self.options.workers,
+            self.executor, lambda done, total: self.progress('rehearsals', done, total),
+        )[:PROPOSED]  # fmt: skip
 
     def _conclude(self, nominal: Outcome, final: Outcome) -> Diagnosis:
         causes = self._causes(nominal, final)

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cg_dynamics.model import Model
+from cg_sysid.advice import Proposal
+from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
 from cg_sysid.trial import Trial
 
@@ -85,6 +87,7 @@ class Cause:
         evidence: In nats against the model without it.
         rivals: Other effects that explain the records as well.
         places: Labels of the same effect at other places that explain the records as well.
+        proposals: Experiments that would tell it from its rivals, best first.
         events: What happened in single records: record -> parameter -> (value, standard
             deviation, unit).
     """
@@ -95,6 +98,7 @@ class Cause:
     rivals: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
     events: Mapping[str, Mapping[str, tuple[float, float, str]]] = field(default_factory=dict)
+    proposals: tuple[Proposal, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,12 +143,14 @@ class Options:
         rounds: Most effects to add.
         workers: Local processes.
         held: Names of the records to hold out; by default every second one of each set-up.
+        experiments: What can be launched next, where these records do not decide.
     """
 
     effects: tuple[str, ...] | None = None
     rounds: int = MOST_ROUNDS
     workers: int | None = None
     held: tuple[str, ...] | None = None
+    experiments: tuple[Experiment, ...] = ()
 
 
 def effect_name(label: str) -> str:

@@ -86,7 +86,7 @@ def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
                 f'of a {body.name}'
             )
     sigma = noise_floor(model, records)
-    return [_trial(body, record, sigma) for record in records]
+    return [as_trial(body, record, sigma) for record in records]
 
 
 def noise_floor(model: Model, records: Sequence[Record]) -> np.ndarray:
@@ -107,7 +107,8 @@ def noise_floor(model: Model, records: Sequence[Record]) -> np.ndarray:
     return np.array(floor)
 
 
-def _trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
+def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
+    """The trial of one record, given the noise floor of each output, shape (ny,)."""
     time = record.time
     names = (*body.inputs, *(name for name in record.inputs if name not in body.inputs))
     outputs = np.column_stack(

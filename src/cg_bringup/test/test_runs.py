@@ -4,19 +4,17 @@ import numpy as np
 import pytest
 import yaml
 
-from cg_bringup.experiments import (
-    ExperimentError,
-    Run,
-    experiment_names,
-    load_experiment,
-    node_parameters,
-    parameter_file_text,
-    parse_experiment,
-)
+from cg_bringup.runs import Run, node_parameters, parameter_file_text
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import (
+    ExperimentError,
+    experiment_names,
+    load_experiment,
+    parse_experiment,
+)
 
 EXPECTED = {
     'spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',

@@ -1,0 +1,116 @@
+"""Experiments as data: which set-up, start, excitation and duration.
+
+Each file of config/experiments is one experiment of docs/experiments.md. No ROS here.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.excitation import ExcitationSettings
+
+
+class ExperimentError(ValueError):
+    """An experiment that does not exist, is wrong, or did not go through."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One experiment.
+
+    Attributes:
+        name: Name of its file.
+        setup: What is done to the rig.
+        initial_state: Coordinates in rad, then rates in rad/s.
+        duration: Length in s.
+        excitation: Settings of the excitation, less duration and seed.
+        description: What it is good for.
+    """
+
+    name: str
+    setup: Setup
+    initial_state: tuple[float, ...]
+    duration: float
+    excitation: Mapping[str, Any]
+    description: str = ''
+
+
+def experiments_directory() -> Path:
+    """Where the experiment files are: beside the sources, or in the installed share directory."""
+    package = Path(__file__).resolve().parent
+    candidates = [package.parent / 'config' / 'experiments']
+    candidates += [
+        parent / 'share' / 'cg_sysid' / 'config' / 'experiments' for parent in package.parents
+    ]
+    for candidate in candidates:
+        if candidate.is_dir():
+            return candidate
+    raise ExperimentError(f'no directory of experiments beside or above {package}')
+
+
+def experiment_names() -> list[str]:
+    """Names of all experiments."""
+    return sorted(path.stem for path in experiments_directory().glob('*.yaml'))
+
+
+def load_experiment(name: str) -> Experiment:
+    """The experiment of that name, or in the file of that path.
+
+    Raises:
+        ExperimentError: naming what is wrong and what is allowed.
+    """
+    path = Path(name) if name.endswith('.yaml') else experiments_directory() / f'{name}.yaml'
+    try:
+        entries = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except OSError:
+        known = ', '.join(experiment_names())
+        raise ExperimentError(f'no experiment {name!r}; there are: {known}') from None
+    except yaml.YAMLError as error:
+        raise ExperimentError(f'{path} is not YAML: {" ".join(str(error).split())}') from None
+    return parse_experiment(path, entries)
+
+
+def experiments_for(model: Model) -> list[Experiment]:
+    """All experiments that a machine like this model can be put to."""
+    found = []
+    for name in experiment_names():
+        experiment = load_experiment(name)
+        try:
+            free = model.mechanism.kinematics(experiment.setup).basis.shape[1]
+        except (DynamicsError, ValueError, KeyError):
+            continue
+        if len(experiment.initial_state) == 2 * free:
+            found.append(experiment)
+    return found
+
+
+def parse_experiment(path: Path, entries: Any) -> Experiment:
+    """An experiment from the content of its file."""
+    allowed = {field.name for field in fields(Experiment)} - {'name'}
+    needed = allowed - {'description'}
+    if not isinstance(entries, dict) or not needed <= set(entries) <= allowed:
+        raise ExperimentError(
+            f'{path}: expected the entries {", ".join(sorted(needed))} and maybe description'
+        )
+    excitation = dict(entries['excitation'])
+    if excitation.get('kind') == 'file':
+        excitation['file'] = str((path.parent / excitation['file']).resolve())
+    try:
+        ExcitationSettings(**excitation, duration=float(entries['duration']))
+        setup = Setup.from_dict(entries['setup'])
+    except (ValueError, TypeError) as error:
+        raise ExperimentError(f'{path}: {error}') from None
+    return Experiment(
+        name=path.stem,
+        setup=setup,
+        initial_state=tuple(float(value) for value in entries['initial_state']),
+        duration=float(entries['duration']),
+        excitation=excitation,
+        description=' '.join(str(entries.get('description', '')).split()),
+    )
