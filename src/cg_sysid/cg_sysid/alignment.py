@@ -1,7 +1,7 @@
 """Alignment: the samples of a raw recording on one time axis.
 
-What is harmless is repaired (a repeated message, two messages that overtook each other); the
-rest is refused with one message.
+What is harmless is repaired (a repeated message, two messages that overtook each other, a clock
+that jumped, a few lost samples of the torque); the rest is refused with one message.
 """
 
 import numpy as np
@@ -9,9 +9,11 @@ import numpy as np
 from cg_dynamics.rig import Setup
 from cg_sysid import channels
 from cg_sysid.channels import APPLIED_TORQUE, TORQUE_COMMAND
+from cg_sysid.clock import mend_clocks
 from cg_sysid.errors import RecordingError
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S, SHARED_ROW_NS, Record, hold, merge_stamps, place
+from cg_sysid.torque_gaps import fill_torque
 
 REGULAR_AFTER_SORTING = 0.3  # smallest spacing after sorting over the median, [1]
 
@@ -34,6 +36,7 @@ def to_record(
     """
     mechanism = channels.mechanism(raw.mechanism)
     setup = raw.setup
+    raw, _ = mend_clocks(raw)
     inputs = _cleaned_inputs(raw, mechanism, setup, torque_topic)
     outputs = {}
     for topic in mechanism.outputs:
@@ -88,7 +91,8 @@ def _cleaned_inputs(
             place_name = mechanism.channel(missing[0]).place
             msg = f'{raw.path}: topic {chosen} holds no {place_name}'
             raise RecordingError(msg)
-        return {**torques, **inputs}
+        filled = {name: fill_torque(*samples) for name, samples in torques.items()}
+        return {**filled, **inputs}
     if setup.fixture == 'legs_tied' and torque_topic is None:
         return inputs  # with the legs tied a hip torque does no work
     msg = (f'{raw.path}: topic missing: '

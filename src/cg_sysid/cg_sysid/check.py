@@ -2,8 +2,9 @@
 
     python3 -m cg_sysid.check BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
 
-The checks themselves are in check_timing.py (stamps), check_signals.py (single signals),
-check_kinematics.py (IMU against itself) and check_content.py (note, coverage, feedback).
+The checks themselves are in clock.py and check_timing.py (stamps), check_signals.py and
+check_steps.py (single signals), check_kinematics.py (IMU against itself), check_dynamics.py
+(motion against torque) and check_content.py (note, coverage, feedback).
 """
 
 import argparse
@@ -17,9 +18,12 @@ from rich.console import Console
 
 from cg_sysid.bags import RawRecording, parse_note, read_raw, to_record
 from cg_sysid.check_content import check_content
+from cg_sysid.check_dynamics import check_dynamics
 from cg_sysid.check_kinematics import check_kinematics
 from cg_sysid.check_signals import check_signals, read_signals
+from cg_sysid.check_steps import check_steps
 from cg_sysid.check_timing import check_timing
+from cg_sysid.clock import mend_clocks
 from cg_sysid.errors import RecordingError
 from cg_sysid.findings import CheckReport, Finding, make_report
 
@@ -50,13 +54,16 @@ def check_recording(
         return make_report(name, [Finding('unreadable', 'error', '', str(error))])
     if setup_error:
         return make_report(raw.name, [setup_error])
+    raw, clocks = mend_clocks(raw)
     signals = read_signals(raw)
-    findings = [
-        *check_timing(raw),
-        *check_signals(raw, signals),
-        *check_kinematics(signals),
-        *check_content(raw, signals, model, use_region),
-    ]
+    findings = [*clocks, *check_timing(raw), *check_signals(raw, signals)]
+    # What depends on several samples makes no sense where single ones, or their stamps, are wrong.
+    faulty = {finding.where for finding in findings if finding.severity == 'error'}
+    sane = {n: s for n, s in signals.items() if not faulty & {n, s.topic}}
+    findings += [*check_steps(raw, sane), *check_kinematics(sane)]
+    sound = not any(finding.severity == 'error' for finding in findings)
+    findings += check_dynamics(raw, signals, sound)
+    findings += check_content(raw, signals, model, use_region)
     if not any(finding.severity == 'error' for finding in findings):
         findings += _refused(raw)
     return make_report(raw.name, _once(findings))

@@ -1,4 +1,4 @@
-"""Checks of single signals: not finite, frozen, clipped, saturated, spiked, shifted.
+"""Checks of single signals: not finite, frozen, clipped, saturated, spiked.
 
 What counts as abnormal is measured against the channel's own noise, resolution and motion, so
 that no limit has to be known. A joint that rests, a coarse encoder and a friction that holds a
@@ -12,23 +12,27 @@ import numpy as np
 
 from cg_sysid.channels import mechanism
 from cg_sysid.findings import Finding
-from cg_sysid.noise import ChannelNoise, channel_noise
+from cg_sysid.noise import ChannelNoise, channel_noise, resolution
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
 
+PIECE = 200  # samples
 FROZEN_SAMPLES = 15  # shortest run of one value that is looked at
+CLIPPED_RUN = 3  # samples at the extreme value in a row that may be a flat top
+TOP_SIDE = 12  # samples beside a flat top that show how fast it was reached
+ALIKE = 0.2  # ratio of the slopes on the two sides of a flat top, at least, [1]
+TOP_QUANTA = 2.5  # a top this many quanta flat is normal, [1]
+TOP_SIGMA = 5.0  # and one that is this many standard deviations of its estimate high, [1]
 ABRUPT = 1.5  # steps this many quanta or sigmas long are motion, [1]
 ACCELERATING = 7.5  # samples in which a motion of the usual acceleration comes to a stop, [1]
 NOISY_SPAN = 20  # samples beside a run in which noise is looked for
 RELEASE = 6.0  # a jump this many usual steps long ends a freeze, [1]
 SPIKE = 10.0  # error of interpolation over its local size, [1]
-SHIFT = 8.0  # step over the noise of a step and over the change of slope around it, [1]
-SHIFT_QUANTA = 4.0  # step over the resolution, [1]
 MANY_SPIKES = 0.01  # share of samples, [1]
 STILL_S = 1.0  # a sensor may be still this long while others move, in s
 STILL_MOVED = 20.0  # motion over the noise floor before the rest, [1]
 STILL_SHARE = 0.2  # and for this share of the recording, [1]
-SATURATED_RUN = 5  # samples at the limit in a row
+LIMIT_RUN = 5  # samples at the limit in a row
 SATURATED_SHARE = 0.01  # share of samples at the limit, [1]
 
 
@@ -52,11 +56,6 @@ class Signal:
     sample: np.ndarray
     noise: ChannelNoise
 
-    @property
-    def step_floor(self) -> float:
-        """Size of a step that noise and rounding alone make now and then."""
-        return max(np.sqrt(2.0) * self.noise.sigma, self.noise.quantum)
-
 
 def read_signals(raw: RawRecording) -> dict[str, Signal]:
     """Every channel of a recording that has enough samples to be checked."""
@@ -75,8 +74,16 @@ def read_signals(raw: RawRecording) -> dict[str, Signal]:
                 continue
             time = (topic.stamp_ns[sample] - origin) / NS_PER_S
             noise = channel_noise(time, values[sample])
+            if noise.quantum == 0.0:
+                noise = replace(noise, quantum=_quantum_of_pieces(values[sample]))
             signals[channel] = Signal(channel, topic.name, time, values[sample], sample, noise)
     return signals
+
+
+def _quantum_of_pieces(values: np.ndarray) -> float:
+    """Resolution of most pieces of a signal: a zero that moved leaves counts in two rows."""
+    pieces = np.array_split(values, max(1, len(values) // PIECE))
+    return float(np.median([resolution(piece) for piece in pieces]))
 
 
 def check_signals(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
@@ -97,13 +104,17 @@ def _check_output(signal: Signal) -> Iterator[Finding]:
     spikes = find_spikes(signal)
     yield from _spikes(signal, spikes)
     signal = _without(signal, spikes)
-    frozen = list(_frozen(signal))
-    yield from frozen
-    yield from _shifts(signal, frozen)
+    clipped, limits = _clipping(signal)
+    yield from clipped
+    yield from _frozen(signal, limits)
+
+
+def without_spikes(signal: Signal) -> Signal:
+    """The signal with its spikes replaced by the line between their neighbours."""
+    return _without(signal, find_spikes(signal))
 
 
 def _without(signal: Signal, samples: np.ndarray) -> Signal:
-    """The signal with some samples replaced by the line between their neighbours."""
     keep = np.setdiff1d(np.arange(len(signal.values)), samples)
     values = np.interp(signal.time, signal.time[keep], signal.values[keep])
     return replace(signal, values=np.where(np.isin(np.arange(len(values)), samples), values,
@@ -163,50 +174,101 @@ def constant_runs(values: np.ndarray, shortest: int) -> list[tuple[int, int]]:
     return list(zip(first[long].tolist(), last[long].tolist(), strict=True))
 
 
-def _frozen(signal: Signal) -> Iterator[Finding]:
-    """A sensor that stops reporting motion, or that cannot follow it beyond a limit.
+def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
+    """Flat tops at the highest or the lowest value, and the limits that they lie at.
+
+    Motion that reaches its highest count stays there for a while, too, and friction may hold it.
+    Then it comes in slowly: a cubic that goes on with the slopes on both sides stays within a
+    count or two. Noise without resolution never repeats its extreme value at all.
+    """
+    values, noise = signal.values, signal.noise
+    findings, limits = [], []
+    for limit in (float(values.max()), float(values.min())):
+        at = values == limit
+        runs = constant_runs(np.where(at, 1.0, 0.0), CLIPPED_RUN)
+        runs = [(a, b) for a, b in runs if at[a]]
+        if not runs:
+            continue
+        analogue = noise.quantum == 0.0 and noise.sigma > 1e-6 * np.ptp(values)
+        heights = [_height_over(signal, a, b) for a, b in runs]
+        a, b = max(runs, key=lambda run: run[1] - run[0])
+        long = [run for run in runs if run[1] - run[0] + 1 >= FROZEN_SAMPLES]
+        abrupt = any(_comes_and_goes(signal, *run) == (True, True) for run in long)
+        if not analogue and not abrupt and not any(height > 1.0 for height in heights):
+            continue
+        length = sum(signal.time[last] - signal.time[first] for first, last in runs)
+        limits.append(limit)
+        findings.append(Finding(
+            'sensor_clipping', 'error', signal.channel,
+            f'stays at {limit:.4g} for {length:.3f} s in all, in flat tops',
+            float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]), float(length),
+            0.0))
+    return findings, limits
+
+
+def _height_over(signal: Signal, first: int, last: int) -> float:
+    """How far a motion would go beyond a flat top, over what rounding and noise may feign."""
+    values, time, noise = signal.values, signal.time, signal.noise
+    n = TOP_SIDE
+    if first < n or last + n >= len(values):
+        return 0.0
+    spacing = float(np.median(np.diff(time)))
+    at = (np.arange(n) + 1.0) * spacing
+    solve = np.linalg.pinv(np.vander(at, 3, increasing=True))[1]
+    up = 1.0 if values[first] == values.max() else -1.0
+    rise = -up * float(solve @ (values[first - n: first][::-1] - values[first]))
+    fall = -up * float(solve @ (values[last + 1: last + 1 + n] - values[last]))
+    width = float(time[last] - time[first]) + spacing
+    # A cubic with these slopes at its ends is this high in its middle.
+    height = width * (rise + fall) / 8.0
+    feigned = width * noise.sigma_floor * float(np.linalg.norm(solve)) * np.sqrt(2.0) / 8.0
+    normal = TOP_QUANTA * noise.quantum + TOP_SIGMA * feigned + 1e-9 * float(np.ptp(values))
+    # Beside a step one slope is not that of a motion.
+    return height / normal if min(rise, fall) > ALIKE * max(rise, fall) > 0.0 else 0.0
+
+
+def _frozen(signal: Signal, limits: list[float]) -> Iterator[Finding]:
+    """A sensor that stops reporting motion.
 
     Nothing that moves several counts per sample stops within one sample without a knock, and
     nothing at rest is somewhere else one sample later. A signal whose noise vanishes has frozen
-    too.
+    too. Flat tops at the limits of a sensor are a finding of their own.
     """
     values, noise = signal.values, signal.noise
-    runs = constant_runs(values, FROZEN_SAMPLES)
+    runs = [(a, b) for a, b in constant_runs(values, FROZEN_SAMPLES) if values[a] not in limits]
     if not runs or np.ptp(values) == 0.0:
         return
     unit = max(noise.quantum, noise.sigma, 1e-9 * np.ptp(values))
     steps = np.abs(np.diff(values))
     usual = max(float(np.quantile(steps, 0.98)), unit)
-    abrupt = ABRUPT * unit + ACCELERATING * _usual_bend(values)
-    clipped: list[tuple[int, int]] = []
     stuck: list[tuple[int, int]] = []
     for first, last in runs:
-        entry, leave = _speed(values[max(0, first - 5): first + 1]), _speed(values[last:last + 6])
+        came, left = _comes_and_goes(signal, first, last)
         release = steps[last] if last < len(steps) else 0.0
-        abrupt_in, abrupt_out = entry > abrupt, leave > abrupt
-        at_limit = values[first] in (values.max(), values.min())
         silent = noise.sigma > noise.quantum and (
             _is_noisy(values[max(0, first - NOISY_SPAN): first])
             or _is_noisy(values[last + 1: last + 1 + NOISY_SPAN])
         )
-        if at_limit and abrupt_in and abrupt_out and release <= RELEASE * usual:
-            clipped.append((first, last))
-        elif release > RELEASE * usual or silent:
+        halts = came and (left or last == len(values) - 1)
+        if release > RELEASE * usual or silent or halts:
             stuck.append((first, last))
-        elif abrupt_in and (abrupt_out or last == len(values) - 1):
-            stuck.append((first, last))
-    for code, runs_found, text in (
-        ('stuck', stuck, 'does not change for {0:.2f} s in all while it should'),
-        ('clipped', clipped, 'stays at {1:.4g} for {0:.2f} s in all, in flat tops'),
-    ):
-        if runs_found:
-            spans = [(signal.time[a], signal.time[b]) for a, b in runs_found]
-            length = sum(b - a for a, b in spans)
-            longest = max(range(len(spans)), key=lambda i: spans[i][1] - spans[i][0])
-            at = runs_found[longest][0]
-            yield Finding(code, 'error', signal.channel, text.format(length, values[at]),
-                          float(spans[longest][0]), float(spans[longest][1]),
-                          int(signal.sample[at]), float(length), 0.0)
+    if stuck:
+        spans = [(signal.time[a], signal.time[b]) for a, b in stuck]
+        length = float(sum(b - a for a, b in spans))
+        longest = max(range(len(spans)), key=lambda i: spans[i][1] - spans[i][0])
+        yield Finding('stuck', 'error', signal.channel,
+                      f'does not change for {length:.2f} s in all while it should',
+                      float(spans[longest][0]), float(spans[longest][1]),
+                      int(signal.sample[stuck[longest][0]]), length, 0.0)
+
+
+def _comes_and_goes(signal: Signal, first: int, last: int) -> tuple[bool, bool]:
+    """Whether a signal moves right before a constant run, and right after it."""
+    values, noise = signal.values, signal.noise
+    unit = max(noise.quantum, noise.sigma, 1e-9 * float(np.ptp(values)))
+    abrupt = ABRUPT * unit + ACCELERATING * _usual_bend(values)
+    before, after = values[max(0, first - 5): first + 1], values[last: last + 6]
+    return _speed(before) > abrupt, _speed(after) > abrupt
 
 
 def _usual_bend(values: np.ndarray) -> float:
@@ -281,78 +343,28 @@ def _spikes(signal: Signal, spikes: np.ndarray) -> Iterator[Finding]:
         at, at, int(signal.sample[spikes[worst]]), float(height[worst]))
 
 
-def _shifts(signal: Signal, frozen: list[Finding]) -> Iterator[Finding]:
-    """Steps that last: a zero that moved, an encoder that lost counts.
+def limit_runs(signal: Signal) -> list[tuple[int, int]]:
+    """Runs along the highest or the lowest value of a torque, as (first, last) indices.
 
-    A step is a change between two samples that the slopes on both sides do not explain. A knock
-    changes the slope, not the value.
+    Steps and square waves hold a level on purpose: they have none.
     """
-    k, size = largest_step(signal.time, signal.values, signal.step_floor, signal.noise.quantum)
-    if k < 0:
-        return
-    at = float(signal.time[k])
-    spans = [(f.start_s or 0.0, f.stop_s or 0.0) for f in frozen]
-    if any(abs(at - stop) < 0.02 or abs(at - start) < 0.02 for start, stop in spans):
-        return  # the release of a frozen sensor, reported as such
-    yield Finding('zero_shift', 'error', signal.channel,
-                  f'jumps by {size:.4g} from one sample to the next and stays there',
-                  float(signal.time[k - 1]), at, int(signal.sample[k]), size,
-                  SHIFT * signal.step_floor)
-
-
-def largest_step(
-    time: np.ndarray, values: np.ndarray, step_floor: float, quantum: float
-) -> tuple[int, float]:
-    """The largest step that the motion around it does not explain.
-
-    Args:
-        time: Increasing sample times in s, shape (M,).
-        values: Samples, shape (M,).
-        step_floor: Step that noise and rounding make, in the unit of the values.
-        quantum: Resolution, in the unit of the values.
-
-    Returns:
-        (index of the first sample after the step, its size); (-1, 0.0) if there is none.
-    """
-    dt, steps = np.diff(time), np.diff(values)
-    side = 6
-    if len(steps) < 4 * side:
-        return -1, 0.0
-    slope = steps / dt
-    window = np.lib.stride_tricks.sliding_window_view(slope, side)
-    level, low, high = np.median(window, axis=1), window.min(axis=1), window.max(axis=1)
-    index = np.arange(side, len(slope) - side)
-    left, right = level[index - side], level[index + 1]
-    spread = np.maximum(high[index - side], high[index + 1])
-    spread = spread - np.minimum(low[index - side], low[index + 1])
-    excess = steps[index] - 0.5 * (left + right) * dt[index]
-    limit = SHIFT * step_floor + SHIFT_QUANTA * quantum + 2.0 * spread * dt[index]
-    limit += 1e-9 * np.ptp(values)
-    lasting = np.abs(excess) > limit
-    # In a gap the motion may turn, and the slopes say nothing.
-    lasting &= dt[index] < 2.5 * np.median(dt)
-    if not lasting.any():
-        return -1, 0.0
-    best = int(np.argmax(np.where(lasting, np.abs(excess) / limit, 0.0)))
-    return int(index[best]) + 1, float(excess[best])
+    values = signal.values
+    if np.ptp(values) == 0.0 or len(np.unique(values)) < 0.05 * len(values):
+        return []
+    near = 1e-6 * float(np.abs(values).max())
+    side = np.where(values >= values.max() - near, 1.0, 0.0)
+    side = np.where(values <= values.min() + near, -1.0, side)
+    return [(a, b) for a, b in constant_runs(side, LIMIT_RUN) if side[a]]
 
 
 def _saturation(signal: Signal) -> Iterator[Finding]:
-    """A torque that runs along a limit. Steps and square waves hold a level on purpose."""
-    values = signal.values
-    peak = float(np.abs(values).max())
-    if peak == 0.0 or len(np.unique(values)) < 0.05 * len(values):
-        return
-    at_limit = np.abs(values) >= peak * (1.0 - 1e-6)
-    runs = [
-        (a, b) for a, b in constant_runs(np.where(at_limit, np.sign(values), 0.0), SATURATED_RUN)
-        if at_limit[a]
-    ]
-    share = sum(b - a + 1 for a, b in runs) / len(values)
+    """A torque that runs along a limit."""
+    runs = limit_runs(signal)
+    share = sum(b - a + 1 for a, b in runs) / len(signal.values)
     if share < SATURATED_SHARE:
         return
     a, b = max(runs, key=lambda run: run[1] - run[0])
     yield Finding('saturation', 'warning', signal.channel,
-                  f'the torque runs along {peak:.4g} N m for {share:.1%} of the samples',
-                  float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]), share,
-                  SATURATED_SHARE)
+                  f'the torque runs along {signal.values[a]:.4g} N m for {share:.1%} of the '
+                  'samples', float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]),
+                  share, SATURATED_SHARE)

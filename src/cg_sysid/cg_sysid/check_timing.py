@@ -5,9 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from cg_sysid.channels import NOTE_TOPIC, TORQUE_COMMAND, mechanism
+from cg_sysid.clock import FLOOR, independent_arrivals, lost_behind_stamps
 from cg_sysid.findings import Finding
 from cg_sysid.raw import RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S
+from cg_sysid.torque_gaps import torque_gaps
 
 GAP = 2.5  # a spacing this many times the usual one lacks samples, [1]
 GAP_REGULAR = 1.8  # the same where the stamps are regular, [1]
@@ -20,7 +22,6 @@ RATE_BLOCK = 25  # samples per block when looking for a change of rate
 CLOCK_JUMP_S = 0.02  # step between stamp and recorder's clock, in s
 LATE_S = 0.5  # a topic that starts later or ends earlier than the others by this, in s
 REGULAR = 0.3  # see bags.REGULAR_AFTER_SORTING
-SAME_CLOCK = 0.05  # durations by stamp and by recorder agree to this: not lock-step, [1]
 
 
 def check_timing(raw: RawRecording) -> Iterator[Finding]:
@@ -42,7 +43,7 @@ def check_timing(raw: RawRecording) -> Iterator[Finding]:
         yield from _order(topic, origin)
         if topic.name in (NOTE_TOPIC, TORQUE_COMMAND):
             continue
-        yield from _clock(topic, origin)
+        yield from _arrivals(raw, topic, origin)
         yield from _gaps(raw, topic, origin)
         yield from _rate(topic, raw.note.get('nominal_rate_hz'), origin)
 
@@ -107,40 +108,60 @@ def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
             _seconds(stamp[k], origin), sample=k, value=len(repeats), allowed=0)
 
 
-def _clock(topic: RawTopic, origin: int) -> Iterator[Finding]:
-    """Steps between the stamps and the recorder's clock.
+def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
+    """Stamps against the recorder's clock: jumps between them, and a rate that only one knows.
 
     In lock-step simulation the two clocks run at different speeds and say nothing about each
     other.
     """
+    if not independent_arrivals(topic) or len(topic) < 4 * FLOOR:
+        return
     stamp, log = topic.stamp_ns, topic.log_ns
-    by_stamp, by_log = np.ptp(stamp), np.ptp(log)
-    if not by_stamp or not by_log:
+    change = _change_of_rate(np.diff(log) / NS_PER_S)
+    if change is not None and _change_of_rate(np.diff(stamp) / NS_PER_S) is None:
+        k, before, after = change
+        yield Finding(
+            'sampling_rate_change', 'error', topic.name,
+            f'messages arrive at {before:.4g} Hz, later at {after:.4g} Hz, but the stamps go on '
+            'as before: they are wrong', _seconds(stamp[k], origin), _seconds(stamp[-1], origin),
+            k, after, before)
+        return
+    known = mechanism(raw.mechanism)
+    ends = [
+        raw.topics[t.name].stamp_ns[-1] for t in (known.torque, *known.outputs)
+        if t.name != topic.name and len(raw.topics.get(t.name, ()))
+    ]
+    holes, lost = lost_behind_stamps(topic, float(np.median(ends)) if ends else np.inf)
+    if holes:
+        k = holes[0]
+        yield Finding(
+            'dropped_samples', 'error', topic.name, f'about {lost} sample(s) lost, the first '
+            'here, while the stamps go on as if none were: they are wrong',
+            _seconds(stamp[k - 1], origin), _seconds(stamp[holes[-1]], origin), k, lost, 0)
         return
     offset = (log - stamp).astype(float) / NS_PER_S
-    n = 15
-    if len(offset) < 4 * n:
-        return
     # Late arrivals come and go and only add to the offset; a clock that jumps moves its floor.
-    windows = np.lib.stride_tricks.sliding_window_view(offset, n).min(axis=1)
-    change = windows[n:] - windows[:-n]  # sample k = index + n
-    k = int(np.argmax(np.abs(change))) + n
-    before, after = np.median(windows[:max(1, k - n)]), np.median(windows[k:])
-    lasting = after - before
-    steady = np.median(np.abs(np.diff(log) - np.diff(stamp))) < 0.25 * np.median(np.diff(stamp))
-    if not steady or abs(change[k - n]) < CLOCK_JUMP_S or abs(lasting) < 0.5 * CLOCK_JUMP_S:
+    windows = np.lib.stride_tricks.sliding_window_view(offset, FLOOR).min(axis=1)
+    moved = windows[FLOOR:] - windows[:-FLOOR]  # sample k = index + FLOOR
+    k = int(np.argmax(np.abs(moved))) + FLOOR
+    before, after = np.median(windows[:max(1, k - FLOOR)]), np.median(windows[k:])
+    lasting = float(after - before)
+    if abs(moved[k - FLOOR]) < CLOCK_JUMP_S or abs(lasting) < 0.5 * CLOCK_JUMP_S:
         return
     jumps = np.abs(np.diff(offset))
-    near = slice(max(0, k - n), min(len(jumps), k + n))
+    near = slice(max(0, k - FLOOR), min(len(jumps), k + FLOOR))
     k = near.start + int(np.argmax(jumps[near])) + 1
     in_log = abs(log[k] - log[k - 1] - np.median(np.diff(log)))
     in_stamp = abs(stamp[k] - stamp[k - 1] - np.median(np.diff(stamp)))
-    guilty = 'stamp' if in_stamp > in_log else "recorder's"
-    yield Finding(
-        'clock_jump', 'error' if guilty == 'stamp' else 'warning', topic.name,
-        f'the {guilty} clock jumps by {1e3 * abs(lasting):.0f} ms against the other',
-        _seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), k, float(lasting),
-        CLOCK_JUMP_S)
+    place = (_seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), k)
+    size = f'{1e3 * abs(lasting):.0f} ms'
+    if in_stamp > in_log:
+        yield Finding('clock_jump', 'error', topic.name, f'the stamps jump by {size} against the '
+                      "recorder's clock", *place, lasting, CLOCK_JUMP_S)
+    else:
+        yield Finding('clock_jump', 'warning', topic.name, f"the recorder's clock jumps by {size} "
+                      'against the stamps', *place, lasting, CLOCK_JUMP_S,
+                      'the stamps count, not the times of arrival')
 
 
 def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
@@ -148,33 +169,57 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
     order = np.argsort(topic.stamp_ns, kind='stable')
     stamp = topic.stamp_ns[order]
     spacing = np.diff(stamp)
-    positive = spacing[spacing > 0]
-    if not len(positive):
+    if not np.any(spacing > 0):
         return
-    usual = float(np.median(positive))
-    regular = np.quantile(positive, 0.95) < REGULAR_SPREAD * usual
-    limit = (GAP_REGULAR if regular else GAP) * usual
+    usual, limit = np.empty(len(spacing)), np.empty(len(spacing))
+    change = _change_of_rate(spacing / NS_PER_S)
+    for part in (slice(0, change[0]), slice(change[0], None)) if change else (slice(None),):
+        positive = spacing[part][spacing[part] > 0]
+        usual[part] = np.median(positive)
+        regular = np.quantile(positive, 0.95) < REGULAR_SPREAD * usual[part][0]
+        limit[part] = (GAP_REGULAR if regular else GAP) * usual[part]
     gaps = np.flatnonzero(spacing > limit)
     if not len(gaps):
         return
-    lost = int(np.sum(np.rint(spacing[gaps] / usual) - 1))
-    worst = gaps[np.argmax(spacing[gaps])]
-    length = spacing[worst] / NS_PER_S
-    is_torque = topic.name == mechanism(raw.mechanism).torque.name
-    unknown = False
-    for k in gaps[spacing[gaps] > LONG_GAP_S * NS_PER_S]:
-        for values in topic.values.values():
-            unknown |= is_torque and values[order][k] != values[order][k + 1]
+    lost = int(np.sum(np.rint(spacing[gaps] / usual[gaps]) - 1))
     share = lost / (len(stamp) + lost)
-    # A sensor that reports only now and then is read as it comes; one that stops is not.
-    useless = share > LOST_SHARE and length > LONG_GAP_S and not (is_torque and not unknown)
+    worst, unknown, repair = int(gaps[np.argmax(spacing[gaps])]), False, 'they are left out'
+    if topic.name == mechanism(raw.mechanism).torque.name:
+        unknown, worst, repair = _torque_over(topic, order, gaps, worst)
+    elif share > LOST_SHARE and spacing[worst] > LONG_GAP_S * NS_PER_S:
+        # A sensor that reports only now and then is read as it comes; one that stops is not.
+        unknown = True
+    length = spacing[worst] / NS_PER_S
+    consequence = '; what happened in between is not known' if unknown else ''
     yield Finding(
-        'gap', 'error' if unknown or useless else 'warning', topic.name,
-        f'{len(gaps)} gap(s), about {lost} sample(s) lost ({share:.1%}); the longest '
-        f'{1e3 * length:.1f} ms instead of {usual / 1e6:.3g} ms'
-        + ('; the torque in between is not known' if unknown else ''),
+        'dropped_samples', 'error' if unknown else 'warning', topic.name,
+        f'{len(gaps)} gap(s), about {lost} sample(s) lost ({share:.1%}); the '
+        f'{"worst" if unknown else "longest"} {1e3 * length:.1f} ms instead of '
+        f'{usual[worst] / 1e6:.3g} ms' + consequence,
         _seconds(stamp[worst], origin), _seconds(stamp[worst + 1], origin),
-        int(order[worst]), length, limit / NS_PER_S)
+        int(order[worst]), length, limit[worst] / NS_PER_S, '' if unknown else repair)
+
+
+def _torque_over(
+    topic: RawTopic, order: np.ndarray, gaps: np.ndarray, worst: int
+) -> tuple[bool, int, str]:
+    """Whether a torque is not known somewhere; the worst gap; what is done about the others."""
+    stamp = topic.stamp_ns[order]
+    filled = 0
+    for values in topic.values.values():
+        known = torque_gaps(stamp, values[order])
+        bad = [gap for gap in known if not gap.known]
+        if bad:
+            return True, max(bad, key=lambda gap: gap.lost).sample, ''
+        filled = max(filled, sum(gap.lost for gap in known))
+        among = {gap.sample for gap in known}
+        for k in gaps:
+            changed = values[order][k] != values[order][k + 1]
+            long = stamp[k + 1] - stamp[k] > LONG_GAP_S * NS_PER_S
+            if k not in among and long and changed:
+                return True, int(k), ''
+    held = 'the torque is held over the gaps'
+    return False, worst, f'{filled} sample(s) filled from their neighbours' if filled else held
 
 
 def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]:
@@ -190,9 +235,10 @@ def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]
     if change is not None:
         k, before, after = change
         yield Finding(
-            'rate_change', 'warning', topic.name,
+            'sampling_rate_change', 'warning', topic.name,
             f'the rate changes midway, from {before:.4g} Hz to {after:.4g} Hz',
-            _seconds(stamp[k], origin), _seconds(stamp[-1], origin), k, after, before)
+            _seconds(stamp[k], origin), _seconds(stamp[-1], origin), k, after, before,
+            'samples count at their stamps, whatever their rate')
     if not isinstance(nominal_hz, int | float) or not nominal_hz > 0:
         return
     if abs(rate / nominal_hz - 1.0) > RATE_TOLERANCE:

@@ -24,12 +24,13 @@ class Finding:
         code: Standard name, such as `gap`; listed in docs/data.md.
         severity: `info`, `warning`, or `error` (the recording is unusable).
         where: Topic or channel; empty where it is about the whole recording.
-        message: One sentence for people.
+        message: One sentence for people, without the repair.
         start_s: Begin of the span concerned, in s since the first stamp; None for all of it.
         stop_s: End of that span.
         sample: Index of the first sample concerned, within its topic.
         value: What was found.
         allowed: What would have been right.
+        repair: What reading does about it; empty if nothing. Part of the printed message.
     """
 
     code: str
@@ -41,6 +42,12 @@ class Finding:
     sample: int | None = None
     value: Any = None
     allowed: Any = None
+    repair: str = ''
+
+    @property
+    def text(self) -> str:
+        """The message, with the repair."""
+        return f'{self.message}; repaired: {self.repair}' if self.repair else self.message
 
     @property
     def place(self) -> str:
@@ -94,7 +101,7 @@ class CheckReport:
         table = Table('severity', 'code', 'where', 'place', 'what', box=None, pad_edge=False)
         for f in self.findings:
             table.add_row(
-                f'[{COLOURS[f.severity]}]{f.severity}[/]', f.code, f.where, f.place, f.message
+                f'[{COLOURS[f.severity]}]{f.severity}[/]', f.code, f.where, f.place, f.text
             )
         console.print(table)
 

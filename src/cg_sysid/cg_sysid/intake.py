@@ -166,7 +166,7 @@ def _reason(report: CheckReport) -> str:
     fault = report.findings[0]
     more = sum(f.severity == 'error' for f in report.findings) - 1
     where = ' '.join(part for part in (fault.where, fault.place) if part)
-    text = f'{where}: {fault.message}' if where else fault.message
+    text = f'{where}: {fault.text}' if where else fault.text
     return f'{text} (and {more} more)' if more else text
 
 
