@@ -28,7 +28,9 @@ from cg_sysid.unknowns import IdentificationError
 STEP_S = 0.002
 FASTER = 4.0  # an excitation is also rehearsed with so many times its highest frequency
 FASTEST_HZ = 12.0
-MOST_RIVALS = 3
+REHEARSED_S = 5.0  # of an experiment; evidence grows with its length
+ITERATIONS = 16
+MOST_RIVALS = 2
 SEED = 20111  # of noise and excitation of the rehearsals
 LEAD_IN_S = 0.1  # of a record, not judged
 
@@ -104,8 +106,8 @@ def _rehearsed(
             for truth, doubted in ((accepted, other), (other, accepted)):
                 models = dict(rivals)
                 trial = imagined(models[truth].model, sigma, experiment, excitation)
-                own, wrong = (_error(models[name], trial) for name in (truth, doubted))
-                worth.append((wrong - own, (accepted, other)))
+                nats = _lost(models[doubted], trial) * experiment.duration / trial.duration
+                worth.append((nats, (accepted, other)))
     except (IdentificationError, DynamicsError, ValueError, np.linalg.LinAlgError):
         return None
     nats, weakest = min(worth)
@@ -115,11 +117,12 @@ def _rehearsed(
 def imagined(
     model: Model, sigma: np.ndarray, experiment: Experiment, excitation: Mapping[str, Any]
 ) -> Trial:
-    """What an experiment would record if the model were the machine."""
-    settings = ExcitationSettings(**excitation, duration=experiment.duration, seed=SEED)
+    """What the first seconds of an experiment would record if the model were the machine."""
+    duration = min(experiment.duration, REHEARSED_S)
+    settings = ExcitationSettings(**excitation, duration=duration, seed=SEED)
     signal = make_signal(settings)
     body = model.mechanism
-    time = STEP_S * np.arange(round(experiment.duration / STEP_S))
+    time = STEP_S * np.arange(round(duration / STEP_S))
     torque = np.array([signal(t) for t in time])
     record = Record(
         name=experiment.name,
@@ -139,9 +142,9 @@ def imagined(
     return replace(trial, outputs=np.where(begun[:, None], trial.outputs, np.nan))
 
 
-def _error(rival: Fit, trial: Trial) -> float:
-    """(EV) of a model that knows what its fit knows, on one more trial."""
-    found = fit(rival.model, [trial])
+def _lost(rival: Fit, trial: Trial) -> float:
+    """Evidence in nats that a trial gives against a model that knows what its fit knows."""
+    found = fit(rival.model, [trial], iterations=ITERATIONS)
     belief = sum(
         ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
         for u, v in zip(found.unknowns, found.values, strict=True)

@@ -25,6 +25,7 @@ FOLLOWED = 3  # starts of a swept parameter that are worth a second look
 SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
 WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
 SETTLED = 1.2  # chi2/N at which nothing is left to find
+STRAINED = 4.0  # tolerances from which a number is not what the model file believes
 SURE = 5.0  # standard deviations from which an event of a record is not chance
 
 
@@ -316,6 +317,16 @@ def _sureness(event: Mapping[str, tuple[float, float, str]]) -> float:
 def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
     """Parameters of the effect tried: name -> (value, standard deviation, unit)."""
     return parameters_of(o, o.label)
+
+
+def strained(o: Outcome) -> dict[str, float]:
+    """Parameters that the fit puts far from what the file believes: tolerances away."""
+    away = {
+        u.name: abs(u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance
+        for u, v in zip(o.train.unknowns, o.train.values, strict=True)
+        if np.isfinite(u.tolerance) and u.name not in o.task.bounds
+    }
+    return {name: tolerances for name, tolerances in away.items() if tolerances > STRAINED}
 
 
 def at_edge(o: Outcome) -> list[str]:

@@ -28,6 +28,7 @@ from cg_sysid.candidates import (
     cost_of,
     events_of,
     parameters_of,
+    strained,
     try_candidate,
 )
 from cg_sysid.diagnosis import (
@@ -41,7 +42,7 @@ from cg_sysid.diagnosis import (
     summary_of,
 )
 from cg_sysid.imperfections import imperfect, with_imperfections
-from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise
+from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.parallel import run_all
 from cg_sysid.record import Record
 from cg_sysid.trial import Trial, prepare
@@ -174,7 +175,7 @@ class _Search:
         """Accept one effect after the other, until nothing more is earned."""
         while len(self._added(o)) < self.options.rounds:
             o = self._with_small_faults(o)
-            if at_noise(o):
+            if settled(o):
                 break
             contest = self._contest(o)
             winner = contest.winner()
@@ -280,22 +281,26 @@ class _Search:
         return self.contests[added]
 
     def _fit_all(self, tasks: list[Task], what: str) -> list[Outcome]:
-        """Fit candidates, those that may still win for as long as it takes."""
-        found: dict[str, Outcome] = {}
-        while tasks:
-            for task, outcome in zip(tasks, self._fit(tasks, what), strict=True):
-                if isinstance(outcome, str):
-                    log.info('%s: %s', task.effect, outcome)
-                elif outcome.label not in found or chi2(outcome) < chi2(found[outcome.label]):
-                    found[outcome.label] = outcome
-            best = min((chi2(o) for o in found.values()), default=0.0)
-            tasks = [
-                replace(o.task, so_far=o.train)
-                for o in found.values()
-                if not o.train.converged and o.task.so_far is None and chi2(o) < IN_REACH * best
-            ]
-            what = f'{what}, in more depth'
-        return list(found.values())
+        """Fit candidates, and go on with those that have not converged and may still win."""
+        first = self._fitted(tasks, what)
+        best = min((chi2(o) for o in first.values()), default=0.0)
+        again = [
+            replace(o.task, so_far=o.train)
+            for o in first.values()
+            if not o.train.converged and chi2(o) < IN_REACH * best
+        ]
+        second = self._fitted(again, f'{what}, in more depth') if again else {}
+        better = {n: o for n, o in second.items() if chi2(o) < chi2(first[n])}
+        return list({**first, **better}.values())
+
+    def _fitted(self, tasks: list[Task], what: str) -> dict[str, Outcome]:
+        found = {}
+        for task, outcome in zip(tasks, self._fit(tasks, what), strict=True):
+            if isinstance(outcome, str):
+                log.info('%s: %s', task.effect, outcome)
+            else:
+                found[outcome.label] = outcome
+        return found
 
     def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
         return run_all(
@@ -357,7 +362,7 @@ class _Search:
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
         return Diagnosis(
             verdict=verdict,
-            summary=summary_of(verdict, causes, gains, left),
+            summary=summary_of(verdict, causes, gains, left, tuple(strained(nominal))),
             causes=tuple(causes),
             gains=gains,
             nominal=self.nominal,

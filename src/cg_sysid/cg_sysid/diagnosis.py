@@ -16,6 +16,8 @@ from cg_sysid.identify import Fit
 from cg_sysid.trial import Trial
 
 MOST_ROUNDS = 4
+NO_GAIN = 1.1  # times the error after, below which the error before is the same
+MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
 
 
 @dataclass(frozen=True)
@@ -179,11 +181,18 @@ def gains_of(
 
 
 def summary_of(
-    verdict: str, causes: Sequence[Cause], gains: Sequence[Gain], left: dict[str, float]
+    verdict: str,
+    causes: Sequence[Cause],
+    gains: Sequence[Gain],
+    left: dict[str, float],
+    strained: Sequence[str] = (),
 ) -> str:
-    """The answer in one or two sentences."""
+    """The answer in one or two sentences; `strained` are numbers the file does not believe."""
     if verdict == 'consistent':
-        return 'The model explains the records down to the noise of the sensors.'
+        text = 'The model explains the records down to the noise of the sensors'
+        if strained:
+            text += f', but with {", ".join(strained)} far from what its file believes'
+        return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
     if verdict == 'unexplained':
         return (
@@ -195,11 +204,23 @@ def summary_of(
         f'{c.label} ({_described(c)})' + (f' or {" or ".join(c.rivals)}' if c.rivals else '')
         for c in causes
     )
-    text = (
-        f'The simulation lacks {named}; with it the held-out error of {biggest.channel} falls '
-        f'from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
-        f'(noise {biggest.noise:.2g}).'
-    )
+    if biggest.before < NO_GAIN * biggest.after and strained:
+        text = (
+            f'The simulation lacks {named}: without it the model follows the records only with '
+            f'{", ".join(strained)} far from what its file believes.'
+        )
+    else:
+        text = (
+            f'The simulation lacks {named}; with it the held-out error of {biggest.channel} '
+            f'falls from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
+            f'(noise {biggest.noise:.2g}).'
+        )
+    best = next((c.proposals[0] for c in causes if c.proposals), None)
+    if best is not None and best.evidence > MARGIN:
+        text += (
+            f' To tell {" from ".join(best.weakest)}, run {best.experiment} '
+            f'(about {best.evidence:.0f} nats expected).'
+        )
     if left:
         text += f' An error above the noise remains in {", ".join(left)}.'
     return text

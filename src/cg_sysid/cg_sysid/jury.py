@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
-from cg_sysid.candidates import Outcome, at_edge, chi2, own_parameters
-from cg_sysid.diagnosis import Candidate, effect_name, per_output
+from cg_sysid.candidates import Outcome, at_edge, chi2, own_parameters, strained
+from cg_sysid.diagnosis import MARGIN, Candidate, effect_name, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.trial import Trial
 
-MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
 # so: it is the order of what integrators and interpolation differ by.
 FIDELITY = 3e-4
@@ -100,6 +99,9 @@ class Jury:
         white = independent > WHITE * _samples(leader)
         fidelity = FIDELITY if white else ROUGH_FIDELITY
         margin = max(MARGIN, fidelity * independent / 2)
+        if at_noise(base):
+            # Beliefs decide, and those are rough: whatever relieves them is a rival.
+            margin = float('inf')
         return Contest(base, tuple(ranked), independent, margin)
 
     def judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
@@ -113,9 +115,13 @@ class Jury:
         reasons = []
         if gained < EARNED:
             reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
-        if significance < SIGNIFICANT or held_gain <= 0:
+        if at_noise(base):
+            # No error is left to explain, but numbers that nobody believes.
+            if strained(o) or not at_noise(o):
+                reasons.append('leaves numbers far from what the model file believes')
+        elif significance < SIGNIFICANT or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
-        if explained < MATERIAL:
+        elif explained < MATERIAL:
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
         reasons += at_edge(o)
@@ -131,6 +137,11 @@ class Jury:
             parameters=own_parameters(o),
             reason='; '.join(reasons),
         )
+
+
+def settled(o: Outcome) -> bool:
+    """True if nothing is left to explain: no error, and no numbers that nobody believes."""
+    return at_noise(o) and not strained(o)
 
 
 def at_noise(o: Outcome) -> bool:
