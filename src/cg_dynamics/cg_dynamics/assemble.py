@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects import Body, Effect
-from cg_dynamics.effects.effect import SPRING_FIELDS, TIME
+from cg_dynamics.effects.effect import SPRING_FIELDS, TIME, reading_rate
 from cg_dynamics.lagrange import manipulator, solve_small
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -170,11 +170,12 @@ def assemble(model: Model, setup: Setup) -> Equations:
 
     # Sensors.
     outputs = mechanism.sensors(*full)
+    moving = {reading_rate(c): ca.jtimes(y, s, ds) for c, y in outputs.items()}
     for e in effects:
         if overrides(e, 'read'):
             if e.states:
                 starts[e.label] = e.initial_readings(outputs, own[e.label])
-            outputs = pass_through(e, e.read(outputs, z_of[e.label], own[e.label]))
+            outputs = pass_through(e, e.read(outputs, z_of[e.label], own[e.label] | moving))
 
     input_delay = ca.SX(0)
     output_delays = {channel: ca.SX(0) for channel in outputs}

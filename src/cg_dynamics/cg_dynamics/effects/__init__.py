@@ -1,16 +1,18 @@
 """The effect library, by standard name. A new effect is one class in one file of this folder.
 
-Every module here that defines a subclass of `Effect` with a name is found by itself.
+Every module here that defines a subclass of `Effect` with a name is found by itself; learned terms
+(unmodelled.py) have a registry of their own.
 """
 
 import importlib
 import pkgutil
 
 from cg_dynamics.effects.effect import Body, Effect
+from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms.mechanism import Mechanism
 
-__all__ = ['LIBRARY', 'Body', 'Effect', 'make_effect']
+__all__ = ['LIBRARY', 'UNMODELLED', 'Body', 'Effect', 'make_effect']
 
 
 def _library() -> dict[str, type[Effect]]:
@@ -20,6 +22,8 @@ def _library() -> dict[str, type[Effect]]:
         for item in contents.values():
             if isinstance(item, type) and issubclass(item, Effect) and 'name' in vars(item):
                 found[item.name] = item
+    for name in UNMODELLED:
+        del found[name]
     return found
 
 
@@ -32,6 +36,7 @@ def make_effect(name: str, mechanism: Mechanism, at: str | None = None) -> Effec
     Raises:
         ModelError: if there is no such effect, or not at such a place.
     """
-    if name not in LIBRARY:
+    known = LIBRARY.get(name) or UNMODELLED.get(name)
+    if known is None:
         raise ModelError(f'unknown effect {name!r}; the library has: {", ".join(LIBRARY)}')
-    return LIBRARY[name](mechanism, at)
+    return known(mechanism, at)

@@ -11,7 +11,7 @@ In every hook `p` maps the effect's own parameter names to symbols and `z` holds
 states, a list; a hook that owns states returns their rates in the same order. Inputs that an
 effect asks for by name in `extra_inputs` come in `p` too: the reported torques, the time since
 the start of the record (`time`, in s), and recorded switches, which count as on where no one
-recorded them.
+recorded them. In `read`, `p` also has the rates of the angles that ideal sensors would report.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,6 +28,11 @@ from cg_dynamics.rig import Setup
 Symbols = Mapping[str, ca.SX]
 SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
 TIME = 'time'  # the extra input that is the time since the start of the record, in s
+
+
+def reading_rate(channel: str) -> str:
+    """Name under which a `read` hook finds the rate in rad/s of the angle of a channel."""
+    return f'd({channel})/dt'
 
 
 @dataclass(frozen=True)
