@@ -45,6 +45,7 @@ from cg_sysid.imperfections import imperfect, with_imperfections
 from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.parallel import run_all
 from cg_sysid.record import Record
+from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
 from cg_sysid.unknowns import IdentificationError
 
@@ -372,7 +373,7 @@ class _Search:
             train=tuple(self.train),
             held=tuple(self.held),
             remaining={c: float(v) for c, v in remaining.items()},
-            findings=tuple(final.train.warnings),
+            findings=(*_small_faults(final), *final.train.warnings),
         )
 
 
@@ -380,6 +381,18 @@ def _shows(o: Outcome, label: str) -> bool:
     """True if a small fault is larger than its uncertainty."""
     value, sigma, _ = next(iter(parameters_of(o, label).values()))
     return abs(value) > SHOWS * sigma
+
+
+def _small_faults(o: Outcome) -> list[str]:
+    """What is there of small faults, in words."""
+    found = []
+    for label in sorted(imperfect(o.model, o.task.bounds)):
+        for name, (value, sigma, unit) in parameters_of(o, label).items():
+            if abs(value) > SHOWS * sigma:
+                found.append(
+                    f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
+                )
+    return found
 
 
 def _cause(final: Outcome, label: str, contest: Contest) -> Cause:

@@ -23,6 +23,7 @@ from cg_sysid.cluster import Cluster
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Diagnosis, Options
 from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
+from cg_sysid.experiments import experiments_for
 from cg_sysid.faults import FaultSignal
 from cg_sysid.intake import Intake, take_in
 from cg_sysid.provenance import provenance
@@ -112,7 +113,7 @@ def work(options: argparse.Namespace) -> int:
             answer = None
         else:
             answer = diagnose(
-                model, intake.records, _options(options, effects, intake), bars, executor
+                model, intake.records, _options(options, effects, intake, model), bars, executor
             )
             lines = diagnosis_curves(answer)
             facts = diagnosis_facts(answer, intake, origin, lines)
@@ -180,7 +181,7 @@ def _effects(text: str | None, model: Model) -> tuple[str, ...] | None:
 
 
 def _options(
-    options: argparse.Namespace, effects: tuple[str, ...] | None, intake: Intake
+    options: argparse.Namespace, effects: tuple[str, ...] | None, intake: Intake, model: Model
 ) -> Options:
     held = None
     if options.held:
@@ -191,7 +192,10 @@ def _options(
                 f'--held {options.held!r} matches {"no" if not held else "every"} record; '
                 f'there are: {", ".join(names)}'
             )
-    return Options(effects=effects, rounds=options.rounds, workers=options.workers, held=held)
+    return Options(
+        effects=effects, rounds=options.rounds, workers=options.workers, held=held,
+        experiments=tuple(experiments_for(model)),
+    )  # fmt: skip
 
 
 def diagnosis_curves(answer: Diagnosis) -> list[curves.Curve]:

@@ -217,6 +217,16 @@ def _cause(cause: Cause, model: Model) -> Facts:
         'evidence_nats': cause.evidence,
         'rivals': [_effect(rival) for rival in cause.rivals],
         'places': list(cause.places),
+        'next_experiments': [
+            {
+                'experiment': p.experiment,
+                'excitation': dict(p.excitation),
+                'duration_s': p.duration,
+                'expected_nats': p.evidence,
+                'tells_apart': list(p.weakest),
+            }
+            for p in cause.proposals
+        ],
         'events': {
             record: _values(values, cause.label, ranges)
             for record, values in cause.events.items()

@@ -16,7 +16,7 @@ from cg_sysid.trial import Trial
 
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
 # so: it is the order of what integrators and interpolation differ by.
-FIDELITY = 3e-4
+FIDELITY = 1.5e-3
 # A model that leaves more than white noise has something wrong, and small differences say less.
 ROUGH_FIDELITY = 2e-3
 WHITE = 0.9  # share of independent samples from which a residual counts as white noise

@@ -6,6 +6,7 @@ from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, left_words, parameter_words
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
 
+WORTH_NATS = 6.0  # that an experiment must promise to be worth its while
 PLACES = {
     'command': '; it acts on the way of the command',
     'transmission': '; it acts in the transmission',
@@ -59,10 +60,28 @@ def _cause(cause: Facts) -> Markup:
         [tag('div', tag('b', 'Could also be ', effect_name(r['label'])),
              tag('p', r['description'], class_='soft small'), class_='rival')
          for r in cause['rivals']],
+        _next_experiment(cause),
         tag('div', tag('b', 'Could also act elsewhere: '),
             listed([effect_name(p) for p in cause['places']], 'or'), class_='rival')
         if cause['places'] else None,
         class_='card',
+    )  # fmt: skip
+
+
+def _next_experiment(cause: Facts) -> Markup | None:
+    """What to record next where rivals are left."""
+    if not cause['next_experiments']:
+        return None
+    best = cause['next_experiments'][0]
+    if best['expected_nats'] < WORTH_NATS:
+        return tag('p', 'No experiment that can be launched would tell them apart.', class_='soft')
+    torque = best['excitation']
+    fastest = f' up to {number(torque["f_max"])} Hz' if 'f_max' in torque else ''
+    return tag('p',
+        tag('b', 'Next: '), tag('code', best['experiment']),
+        f' ({torque["kind"]}{fastest}, {number(best["duration_s"])} s) would tell ',
+        listed([effect_name(name) for name in best['tells_apart']], 'and'),
+        f' apart with about {number(best["expected_nats"])} nats.',
     )  # fmt: skip
 
 

@@ -1,0 +1,60 @@
+"""Where recordings cannot tell causes apart, the next experiment is named, and it does."""
+
+import pytest
+
+from cg_dynamics.model import Model
+from cg_sysid.advice import imagined
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import MARGIN, Options
+from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import experiments_for, load_experiment
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+EFFECTS = ('ankle_friction', 'spring_damping', 'aerodynamic_drag', 'torque_bias')
+
+
+def _record(machine, name, seed, duration, excitation=None):
+    experiment = load_experiment(name)
+    settings = ExcitationSettings(
+        **(excitation or experiment.excitation), duration=duration, seed=seed
+    )
+    return rehearse(
+        f'{name}_{seed}', machine, experiment.setup, experiment.initial_state,
+        [make_signal(settings)], duration, seed=seed,
+    )  # fmt: skip
+
+
+def test_the_proposed_experiment_settles_what_is_ambiguous(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_values({'c1': 1.1 * nominal.values['c1']})
+    machine = machine.with_effect('ankle_friction', coefficient=0.8)
+    records = [_record(machine, 'spring_stabilised_inner', seed, 6.0) for seed in (1, 2)]
+    options = Options(effects=EFFECTS, workers=1, experiments=tuple(experiments_for(nominal)))
+    first = diagnose(nominal, records, options)
+    assert first.verdict == 'ambiguous'
+    (cause,) = first.causes
+    assert {cause.label, *cause.rivals} == {'ankle_friction', 'spring_damping'}
+    best = cause.proposals[0]
+    assert best.evidence > MARGIN
+    assert best.experiment != 'spring_stabilised_inner'
+    assert best.experiment in first.summary
+    records += [
+        _record(machine, best.experiment, seed, best.duration, best.excitation)
+        for seed in (3, 4)
+    ]  # fmt: skip
+    second = diagnose(nominal, records, options)
+    assert second.verdict == 'explained'
+    assert [c.label for c in second.causes] == ['ankle_friction']
+
+
+def test_imagined_record_is_what_the_machine_would_record(model_file):
+    # The compiled rollout of the rehearsal beside the plant, which shares the model only.
+    nominal = Model.load(model_file)
+    experiment = load_experiment('swing_inner_fixed')
+    record = _record(nominal, 'swing_inner_fixed', 20111, 5.0)
+    (trial,) = prepare(nominal, [record])
+    seen = imagined(nominal, trial.sigma, experiment, experiment.excitation)
+    difference = (seen.outputs - trial.outputs)[100:] / trial.sigma
+    # Two draws of noise: the difference has a standard deviation of sqrt(2).
+    assert difference.std() == pytest.approx(2**0.5, rel=0.1)

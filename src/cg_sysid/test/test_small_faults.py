@@ -1,0 +1,93 @@
+"""What every robot has a little of is no cause, and hides none."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
+from cg_sysid.imperfections import SOUND, imperfect, with_imperfections
+from cg_sysid.rehearse import rehearse
+
+EFFECTS = (
+    'torque_bias', 'encoder_offset', 'actuator_delay', 'actuator_lag', 'quadratic_friction',
+    'spring_stiffness', 'imu_offset', 'viscous_friction',
+)  # fmt: skip
+
+
+def _springs(stiffness):
+    return Setup(springs=tuple(Spring('inner', 1.0, (x, 1.0), stiffness, 0.5) for x in (1.3, -1.3)))
+
+
+def _records(machine):
+    """Four records on springs 1 % stiffer than their notes say."""
+    found = []
+    for k in range(4):
+        record = rehearse(
+            f'record_{k}', machine, _springs(202.0), [0.1 - 0.07 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.4 + 0.1 * k + 0.15 * t) * t)],
+            5.0, 0.004, k,
+        )  # fmt: skip
+        found.append(replace(record, setup=_springs(200.0)))
+    return found
+
+
+def _with_small_faults(machine):
+    key = 'coulomb_friction.transition_rate'
+    machine = machine.with_values({key: 0.5 * machine.values[key]})
+    return machine.with_effect('actuator_delay', delay=0.001).with_effect(
+        'encoder_offset', offset=3e-4
+    )
+
+
+@pytest.fixture
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+def test_small_faults_alone_are_consistent(nominal):
+    machine = _with_small_faults(nominal.with_values({'c4': 1.08 * nominal.values['c4']}))
+    found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
+    assert found.verdict == 'consistent'
+    # They are many times the noise all the same, and found to be what they are.
+    assert found.baseline.held.normalised_error > 10
+    assert any(f.startswith('actuator_delay.delay = ') for f in found.findings)
+    identified = found.extended.train.model.values['actuator_delay.delay']
+    assert identified == pytest.approx(0.001, rel=0.05)  # a quarter of a sample
+
+
+@pytest.mark.parametrize(
+    ('effect', 'values'),
+    [
+        ('torque_bias', {'bias': 0.3}),
+        ('encoder_offset', {'offset': 0.012}),
+        ('actuator_delay', {'delay': 0.008}),
+        ('quadratic_friction', {'coefficient': 0.2}),
+    ],
+)
+def test_a_cause_is_named_among_small_faults(nominal, effect, values):
+    machine = nominal
+    for name, value in (('actuator_delay', 0.001), ('encoder_offset', 3e-4)):
+        if name != effect:
+            machine = machine.with_effect(name, None, **{SOUND[name][0]: value})
+    machine = machine.with_effect(effect, None, **values)
+    found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
+    assert [cause.label for cause in found.causes] == [effect]
+    for name, true in values.items():
+        value, sigma, _ = found.causes[0].parameters[name]
+        # Four standard deviations, and what integrators differ by.
+        assert abs(value - true) < 4 * sigma + 5e-3 * abs(true)
+
+
+def test_small_faults_stay_within_their_bounds(nominal):
+    model, bounds = with_imperfections(nominal, [_springs(200.0)])
+    assert imperfect(model, bounds) == {
+        'actuator_delay', 'encoder_offset', 'imu_offset', 'spring_stiffness',
+        'spring_stiffness@spring1',
+    }  # fmt: skip
+    # What the file itself states is no small fault.
+    stated = nominal.with_effect('encoder_offset', offset=0.01)
+    assert 'encoder_offset' not in imperfect(*with_imperfections(stated, [_springs(200.0)]))
