@@ -14,10 +14,11 @@ from cg_sysid.check_signals import Signal, without_spikes
 from cg_sysid.findings import Finding
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
-from cg_sysid.steps import Step, find_step
+from cg_sysid.steps import Step, find_step, step_at
 
-AT_ONCE = 3.0  # sampling times between steps of one event, [1]
 SURE = 4.0  # standard deviations within which two numbers count as equal, [1]
+SHORT = 1.5  # sampling times by which a topic that lost samples ends early, at least, [1]
+AT_ONCE = 3.0  # sampling times between steps of one event, [1]
 MOVING = 6.0  # standard deviations of its rate from which a channel counts as moving, [1]
 MIRRORED = 0.01  # of the size of a step by which a mirror image may be off, [1]
 SHARE = 0.15  # of a missing time that may be wrong because the rate changes over it, [1]
@@ -31,28 +32,29 @@ def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
         signals: Its channels, without those that froze or that ran into a limit.
     """
     known = mechanism(raw.mechanism)
-    steps: dict[str, Step] = {}
-    for name in (*known.input_names, *known.output_names):
-        if name not in signals or name == 'imu_rate' or np.ptp(signals[name].values) == 0.0:
-            continue
-        signal = without_spikes(signals[name])
-        step = find_step(signal.time, signal.values, signal.noise.sigma, signal.noise.quantum)
-        if step:
-            steps[name] = step
-    for name, step in steps.items():
+    clean = {
+        name: without_spikes(signals[name])
+        for name in (*known.input_names, *known.output_names)
+        if name in signals and np.ptp(signals[name].values) > 0.0
+    }
+    for name, signal in clean.items():
         if not name.endswith('angle'):
-            continue  # a torque may jump; here it is a witness only
-        signal = signals[name]
+            continue  # a torque may jump, and a rate at a knock
+        step = find_step(signal.time, signal.values, signal.noise.sigma, signal.noise.quantum)
+        if step is None:
+            continue
         place = (float(signal.time[step.sample - 1]), step.time, int(signal.sample[step.sample]))
-        missing = _missing_time(name, step, steps, raw, signal)
+        missing = _missing_time(step, signal, clean, raw)
+        together = _others_jump(step, signal, clean)
         if _mirrored(step):
             yield Finding('sign_error', 'error', name, f'jumps from {step.before:.4g} to '
                           f'{step.after:.4g} rad and goes on with the opposite sign', *place,
                           step.after, step.before)
-        elif missing:
+        elif missing or together:
+            time = f'{1e3 * missing:.3g} ms are' if missing else 'time is'
             yield Finding('dropped_samples', 'error', signal.topic, f'{name} jumps by '
-                          f'{step.size:.4g} rad, as far as it moves in {1e3 * missing:.3g} ms, '
-                          'while the stamps show no gap: they are wrong', *place, missing, 0.0)
+                          f'{step.size:.4g} rad: {time} missing in the stamps, which show no gap',
+                          *place, missing or None, 0.0)
         else:
             yield Finding('zero_shift', 'error', name, f'jumps by {step.size:.4g} rad from one '
                           'sample to the next and stays there', *place, step.size, step.limit)
@@ -67,35 +69,51 @@ def _mirrored(step: Step) -> bool:
 
 
 def _missing_time(
-    name: str, step: Step, steps: dict[str, Step], raw: RawRecording, signal: Signal
+    step: Step, signal: Signal, signals: dict[str, Signal], raw: RawRecording
 ) -> float:
     """Time in s that is missing from the stamps, if that explains a step; 0 otherwise."""
-    time, sigma = _time_of(step)
-    if time <= 0.0:
+    stamps = [raw.topics[name].stamp_ns for name in _measured(raw) if name != signal.topic]
+    own = raw.topics[signal.topic].stamp_ns
+    if stamps:
+        late = (float(np.median([s[0] for s in stamps])) - own[0]) / NS_PER_S
+        early = (float(np.median([s[-1] for s in stamps])) - own[-1]) / NS_PER_S
+        usual = float(np.median(np.diff(signal.time)))
+        if abs(late) < SHORT * usual < early:
+            return early  # it began with the others, and ends before them
+    rate = 0.5 * (step.rate_before + step.rate_after)
+    if abs(rate) < MOVING * step.rate_sigma or step.size / rate <= 0.0:
         return 0.0
+    time = step.size / rate
+    agree = [_jumps_too(s, step.time, time) for s in signals.values() if s is not signal]
+    return time if True in agree and False not in agree else 0.0
+
+
+def _others_jump(step: Step, signal: Signal, signals: dict[str, Signal]) -> bool:
+    """Whether a sensor of another topic jumps too: two zeros do not move at once."""
     usual = float(np.median(np.diff(signal.time)))
-    for other, its in steps.items():
-        its_time, its_sigma = _time_of(its)
-        apart = SURE * np.hypot(sigma, its_sigma) + SHARE * time
-        at_once = abs(its.time - step.time) < AT_ONCE * usual
-        if other != name and at_once and its_time > 0.0 and abs(its_time - time) < apart:
-            return time
-    ends = {t: int(raw.topics[t].stamp_ns[-1]) for t in {signal.topic, *_measured(raw)}}
-    late = float(np.median([end for t, end in ends.items() if t != signal.topic] or [0]))
-    early = (late - ends[signal.topic]) / NS_PER_S
-    return time if early > 0.5 * usual and abs(early - time) < SURE * sigma + SHARE * time else 0.0
+    for other in signals.values():
+        if other.topic == signal.topic or other.channel.endswith('rate'):
+            continue
+        noise = other.noise
+        its = find_step(other.time, other.values, noise.sigma, noise.quantum)
+        if its and abs(its.time - step.time) < AT_ONCE * usual:
+            return True
+    return False
+
+
+def _jumps_too(signal: Signal, instant: float, time: float) -> bool | None:
+    """Whether a channel jumps as far as it moves in that time; None if that cannot be seen."""
+    noise = signal.noise
+    step = step_at(signal.time, signal.values, noise.sigma, noise.quantum, instant)
+    if step is None:
+        return None
+    rate = 0.5 * (step.rate_before + step.rate_after)
+    least = SURE * float(np.hypot(step.sigma, time * step.rate_sigma)) + noise.quantum
+    if abs(rate * time) < 2.0 * least:
+        return None
+    return abs(step.size - rate * time) < least + SHARE * abs(rate * time)
 
 
 def _measured(raw: RawRecording) -> list[str]:
     known = mechanism(raw.mechanism)
     return [t.name for t in (known.torque, *known.outputs) if len(raw.topics.get(t.name, ()))]
-
-
-def _time_of(step: Step) -> tuple[float, float]:
-    """Time in s in which the motion would make the step, and its standard deviation; or 0."""
-    rate = 0.5 * (step.rate_before + step.rate_after)
-    sigma = step.rate_sigma / np.sqrt(2.0)
-    if abs(rate) < MOVING * sigma:
-        return 0.0, 0.0
-    time = step.size / rate
-    return time, float(np.hypot(step.sigma, time * sigma) / abs(rate))

@@ -12,7 +12,8 @@ import numpy as np
 
 SPANS = (6, 12, 25, 50)  # samples on each side
 CERTAIN = 5.0  # standard deviations of the distance that noise makes, [1]
-ROUNDING = 2.0  # resolution may make a distance of so many quanta, [1]
+ROUNDING = 4.0  # resolution may make a distance of so many quanta, [1]
+JITTER = 0.03  # an instant of measurement is known to this share of the spacing, [1]
 USUAL = 3.0  # distance over that around it, where the motion is rougher than parabolas, [1]
 AROUND = 3  # spans on each side that show what is usual, but 100 samples at least
 AGREE = 0.3  # distances of two spans differ by less than this share, and noise
@@ -33,7 +34,7 @@ class Step:
         rate_after: Rate just after it.
         rate_sigma: Standard deviation of these rates.
         sigma: Standard deviation of the size.
-        limit: Smallest size that counts here.
+        limit: Smallest size that counts here; 0 where it was not asked for.
     """
 
     sample: int
@@ -66,16 +67,18 @@ def find_step(
     """
     spacing = np.diff(time)
     usual = float(np.median(spacing))
-    grid = time[0] + usual * np.arange(round((time[-1] - time[0]) / usual) + 1)
+    grid, sampled = _on_grid(time, values)
     if len(grid) < 4 * spans[-1] or len(grid) > 2 * len(time):
         return None
-    sampled = np.interp(grid, time, values)
     holes = np.flatnonzero(spacing > HOLE * usual)
+    width = 2 * spans[0] + 1
+    moved = np.abs(np.convolve(np.gradient(sampled), np.ones(width) / width, 'same'))
     score = np.zeros((len(spans), len(grid)))
     size = np.zeros_like(score)
     for i, span in enumerate(spans):
         distance = _distance(sampled, span)
         least = CERTAIN * sigma * _spread(span) + ROUNDING * quantum + 1e-9 * np.ptp(values)
+        least = least + CERTAIN * JITTER * moved
         limit = np.maximum(least, USUAL * _usual(np.abs(distance), span))
         for k in holes:
             a, b = np.searchsorted(grid, [time[k], time[k + 1]])
@@ -93,10 +96,30 @@ def find_step(
     if agreed[best] <= 1.0:
         return None
     widest = int(np.argmax(score[:, best]))
-    return _step(time, grid, sampled, best, spans[widest], sigma, quantum, score[widest, best])
+    limit = abs(size[widest, best]) / score[widest, best]
+    return _step(time, grid, sampled, best, spans[widest], sigma, quantum, float(limit))
 
 
-def _step(time, grid, sampled, k, span, sigma, quantum, score) -> Step:
+def step_at(
+    time: np.ndarray, values: np.ndarray, sigma: float, quantum: float, instant: float
+) -> Step | None:
+    """What a signal does at an instant at which another one has a step; None near the ends."""
+    grid, sampled = _on_grid(time, values)
+    k = int(np.searchsorted(grid, instant - 0.5 * (grid[1] - grid[0])))
+    span = SPANS[1]
+    if k < span or k > len(grid) - span:
+        return None
+    return _step(time, grid, sampled, k, span, sigma, quantum, 0.0)
+
+
+def _on_grid(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times at the usual spacing, and the values there."""
+    usual = float(np.median(np.diff(time)))
+    grid = time[0] + usual * np.arange(round((time[-1] - time[0]) / usual) + 1)
+    return grid, np.interp(grid, time, values)
+
+
+def _step(time, grid, sampled, k, span, sigma, quantum, limit) -> Step:
     """What the step between the grid's samples k - 1 and k is like."""
     noise = float(np.hypot(sigma, quantum / np.sqrt(12.0)))
     left, right = sampled[k - span: k], sampled[k: k + span]
@@ -114,7 +137,7 @@ def _step(time, grid, sampled, k, span, sigma, quantum, score) -> Step:
         rate_after=float(after[1]),
         rate_sigma=noise * float(np.linalg.norm(solve[1])),
         sigma=noise * _spread(span),
-        limit=abs(size) / float(score),
+        limit=limit,
     )
 
 
