@@ -19,7 +19,8 @@ EFFECTS = (
 
 
 def _springs(stiffness):
-    return Setup(springs=tuple(Spring('inner', 1.0, (x, 1.0), stiffness, 0.5) for x in (1.3, -1.3)))
+    pair = (Spring('inner', 1.0, (x, 1.0), stiffness, 0.5) for x in (1.3, -1.3))
+    return Setup(springs=tuple(pair))
 
 
 def _records(machine):
