@@ -55,6 +55,7 @@ LEAD_IN_S = 0.1  # of each record, not judged
 LEAD_IN_SHARE = 0.05  # of a short record
 REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
+MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 IN_REACH = 10.0  # times the smallest error, from which a fit that has not converged may win
 Progress = Callable[[str, int, int], None]
@@ -147,7 +148,8 @@ class _Search:
         self.nominal, self.options, self.progress = model, options, progress
         self.train, self.held, self.executor = train, held, executor
         self.jury = Jury(train, held)
-        self.contests: dict[frozenset[str], Contest] = {}
+        # By the labels of what was added, and whether small faults are allowed for.
+        self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.rounds: list[Round] = []
 
     def run(self) -> Diagnosis:
@@ -196,8 +198,8 @@ class _Search:
         if isinstance(found, str):
             log.info('small faults: %s', found)
             return o
-        contest = self.jury.contest(o, [found])
-        return found if contest.ranked[0][0].evidence > EARNED else o
+        # Beside a large cause they would explain a little of it; then they can wait.
+        return found if chi2(found) < MOST_OF_IT * chi2(o) else o
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
         """Without those small faults that, beside the causes, explain nothing any more."""
@@ -244,30 +246,33 @@ class _Search:
     def _without(self, nominal: Outcome, final: Outcome, label: str) -> Contest | None:
         """The library in competition for the place of one of several effects."""
         others = self._added(final) - {label}
-        if others not in self.contests:
+        key = others, bool(final.task.bounds)
+        if key not in self.contests:
             bounds = final.task.bounds
             model = final.model.without_effect(label)
             if bounds:
                 model, missing = with_imperfections(model, self._setups())
                 bounds = {**bounds, **missing}
             task = Task(model, events=final.events, bounds=bounds)
-            lean = self._fit([task], f'model without {label}')[0] if others else nominal
+            known = not others and not bounds
+            lean = nominal if known else self._fit([task], f'model without {label}')[0]
             if isinstance(lean, str):
                 log.info('without %s: %s', label, lean)
                 return None
             self._contest(lean)
-        contest = self.contests[others]
+        contest = self.contests[key]
         # The fit beside the others may have been better, or the only one that went through.
         ranked = contest.of(label)
         if ranked is None or chi2(final) < chi2(ranked[1]):
             outcomes = [o for _, o in contest.ranked if o.label != label]
             contest = self.jury.contest(contest.base, [*outcomes, replace(final, label=label)])
-            self.contests[others] = contest
+            self.contests[key] = contest
         return contest
 
     def _contest(self, base: Outcome) -> Contest:
         added = self._added(base)
-        if added not in self.contests:
+        key = added, bool(base.task.bounds)
+        if key not in self.contests:
             recorded = {name for trial in self.train for name in trial.input_names}
             bounds = base.task.bounds
             effects = candidates_for(
@@ -278,8 +283,8 @@ class _Search:
             effects.sort(key=cost_of, reverse=True)
             tasks = [Task(base.model, effect, base.events, bounds) for effect in effects]
             outcomes = self._fit_all(tasks, f'effects on top of {self._title(added)}')
-            self.contests[added] = self.jury.contest(base, outcomes)
-        return self.contests[added]
+            self.contests[key] = self.jury.contest(base, outcomes)
+        return self.contests[key]
 
     def _fit_all(self, tasks: list[Task], what: str) -> list[Outcome]:
         """Fit candidates, and go on with those that have not converged and may still win."""

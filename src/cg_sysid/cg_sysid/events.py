@@ -18,7 +18,7 @@ from cg_sysid.identify import fit
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, Unknown, awake, own_unknowns
 
-GRID_S = 0.1
+GRID_S = 0.2
 FOLLOWED = 3  # peaks from which a fit goes on
 
 
