@@ -31,6 +31,7 @@ from cg_sysid.candidates import (
     strained,
     try_candidate,
 )
+from cg_sysid.characterise import characterise
 from cg_sysid.diagnosis import (
     Cause,
     Diagnosis,
@@ -309,13 +310,13 @@ class _Search:
         return found
 
     def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
+        return self._run(try_candidate, [(task, self.train, self.held) for task in tasks], what)
+
+    def _run(self, function: Callable, arguments: list[tuple], what: str) -> list:
         return run_all(
-            try_candidate,
-            [(task, self.train, self.held) for task in tasks],
-            workers=self.options.workers,
-            executor=self.executor,
-            progress=lambda done, total: self.progress(what, done, total),
-        )
+            function, arguments, self.options.workers, self.executor,
+            lambda done, total: self.progress(what, done, total),
+        )  # fmt: skip
 
     def _title(self, added: frozenset[str]) -> str:
         return ' + '.join(['nominal', *sorted(added)])
@@ -363,12 +364,16 @@ class _Search:
             verdict = 'ambiguous'
         else:
             verdict = 'explained'
+        unmodelled = characterise(final, self.train, self.held, self._run) if left else None
         gains = gains_of(self.nominal, self.held, nominal.held, final.held)
         reference = self.jury.judge(nominal, nominal, 0.0)
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
         return Diagnosis(
             verdict=verdict,
-            summary=summary_of(verdict, causes, gains, left, tuple(strained(nominal))),
+            summary=summary_of(
+                verdict, causes, gains, left, tuple(strained(nominal)), unmodelled,
+                self.options.effects,
+            ),
             causes=tuple(causes),
             gains=gains,
             nominal=self.nominal,
@@ -379,7 +384,8 @@ class _Search:
             held=tuple(self.held),
             remaining={c: float(v) for c, v in remaining.items()},
             findings=(*_small_faults(final), *final.train.warnings),
-        )
+            unmodelled=unmodelled,
+        )  # fmt: skip
 
 
 def _shows(o: Outcome, label: str) -> bool:

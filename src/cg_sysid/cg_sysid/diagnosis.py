@@ -14,6 +14,7 @@ from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
 from cg_sysid.trial import Trial
+from cg_sysid.unmodelled import NOTHING, Unmodelled
 
 MOST_ROUNDS = 4
 NO_GAIN = 1.1  # times the error after, below which the error before is the same
@@ -120,6 +121,8 @@ class Diagnosis:
         held: Trials held out.
         remaining: chi2/N of each output that the extended model leaves on held-out records.
         findings: What a person should know: warnings of the fits, lumps out of tolerance.
+        unmodelled: What the extended model leaves above the noise, as a learned term; None if it
+            leaves nothing or no such term is significant.
     """
 
     verdict: str
@@ -134,6 +137,7 @@ class Diagnosis:
     held: tuple[Trial, ...]
     remaining: dict[str, float]
     findings: tuple[str, ...] = ()
+    unmodelled: Unmodelled | None = None
 
 
 @dataclass(frozen=True)
@@ -186,8 +190,20 @@ def summary_of(
     gains: Sequence[Gain],
     left: dict[str, float],
     strained: Sequence[str] = (),
+    unmodelled: Unmodelled | None = None,
+    tried: Sequence[str] | None = None,
 ) -> str:
-    """The answer in one or two sentences; `strained` are numbers the file does not believe."""
+    """The answer in a few sentences.
+
+    Args:
+        verdict: The verdict.
+        causes: Named causes.
+        gains: Errors before and after.
+        left: Outputs with an error above the noise.
+        strained: Numbers that the file does not believe.
+        unmodelled: What is left, as a learned term.
+        tried: Effects that were tried; None for the whole library.
+    """
     if verdict == 'consistent':
         text = 'The model explains the records down to the noise of the sensors'
         if strained:
@@ -195,10 +211,11 @@ def summary_of(
         return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
     if verdict == 'unexplained':
+        whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
         return (
-            f'Something is missing that no effect of the library explains: {biggest.channel} is '
+            f'Something is missing that no effect {whose} explains: {biggest.channel} is '
             f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
-            f'{biggest.noise:.2g}.'
+            f'{biggest.noise:.2g}. {unmodelled.text if unmodelled else NOTHING}'
         )
     named = ', '.join(
         f'{c.label} ({_described(c)})' + (f' or {" or ".join(c.rivals)}' if c.rivals else '')
@@ -223,6 +240,7 @@ def summary_of(
         )
     if left:
         text += f' An error above the noise remains in {", ".join(left)}.'
+        text += f' {unmodelled.text}' if unmodelled else ''
     return text
 
 
