@@ -18,7 +18,7 @@ from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
-FIRST_ITERATIONS = 16  # of a first fit to whole records; most have converged by then
+FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 MOST_STARTS = 24
 FOLLOWED = 3  # starts of a swept parameter that are worth a second look
@@ -26,6 +26,7 @@ SEEKINGS = 4  # times that the instants of an event are sought, each with better
 WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
 SETTLED = 1.2  # chi2/N at which nothing is left to find
 STRAINED = 4.0  # tolerances from which a number is not what the model file believes
+TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none at all
 SURE = 5.0  # standard deviations from which an event of a record is not chance
 
 
@@ -327,6 +328,20 @@ def strained(o: Outcome) -> dict[str, float]:
         if np.isfinite(u.tolerance) and u.name not in o.task.bounds
     }
     return {name: tolerances for name, tolerances in away.items() if tolerances > STRAINED}
+
+
+def too_small(o: Outcome) -> list[str]:
+    """An effect whose size is as good as none is not what helped."""
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    if kind is None:
+        return []
+    first = kind.parameters[0]
+    if first.neutral is None or not np.isfinite(first.neutral) or first.each:
+        return []
+    value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
+    if abs(value - first.neutral) > TOO_SMALL * sigma:
+        return []
+    return [f'{first.name} = {value:.3g} +- {sigma:.2g} {unit} is as good as none']
 
 
 def at_edge(o: Outcome) -> list[str]:

@@ -31,7 +31,7 @@ from cg_sysid.candidates import (
     strained,
     try_candidate,
 )
-from cg_sysid.characterise import characterise
+from cg_sysid.characterise import what_remains
 from cg_sysid.diagnosis import (
     Cause,
     Diagnosis,
@@ -186,8 +186,19 @@ class _Search:
             self._note(contest, winner[0].label if winner else '')
             if winner is None:
                 break
-            o = winner[1]
+            o = self._refitted(winner[1])
         return o
+
+    def _refitted(self, o: Outcome) -> Outcome:
+        """The same structure from the file's numbers again, if that comes out better.
+
+        What stands as the base of a round has to be as good as it can be, or the next effect is
+        accepted for a better fit of this one.
+        """
+        task = Task(o.model, events=o.events, bounds=o.task.bounds)
+        again = self._fit([task], f'{o.label} again')
+        better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
+        return replace(better[0], label=o.label) if better else o
 
     def _with_small_faults(self, o: Outcome) -> Outcome:
         """The same with what every robot has a little of, if that explains anything."""
@@ -352,19 +363,29 @@ class _Search:
             self.executor, lambda done, total: self.progress('rehearsals', done, total),
         )[:PROPOSED]  # fmt: skip
 
+    def _remaining(self, o: Outcome) -> dict[str, float]:
+        """chi2/N of each output on held-out records."""
+        names, errors = self.nominal.mechanism.outputs, per_output(o.held)
+        return {name: float(error) for name, error in zip(names, errors, strict=True)}
+
+    def _left(self, o: Outcome) -> dict[str, float]:
+        """Those of them that are above the noise."""
+        return {c: v for c, v in self._remaining(o).items() if v > (1 + MATERIAL) ** 2}
+
     def _conclude(self, nominal: Outcome, final: Outcome) -> Diagnosis:
-        causes = self._causes(nominal, final)
-        remaining = dict(
-            zip(self.nominal.mechanism.outputs, per_output(final.held), strict=True)
-        )
-        left = {c: v for c, v in remaining.items() if v > (1 + MATERIAL) ** 2}
+        unmodelled = None
+        if self._left(final):
+            unmodelled, stand = what_remains(
+                nominal, final, self._added(final), self.train, self.held, self._run
+            )
+            final = final if stand else nominal
+        causes, left = self._causes(nominal, final), self._left(final)
         if not causes:
             verdict = 'unexplained' if left else 'consistent'
         elif any(cause.rivals for cause in causes):
             verdict = 'ambiguous'
         else:
             verdict = 'explained'
-        unmodelled = characterise(final, self.train, self.held, self._run) if left else None
         gains = gains_of(self.nominal, self.held, nominal.held, final.held)
         reference = self.jury.judge(nominal, nominal, 0.0)
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
@@ -382,7 +403,7 @@ class _Search:
             rounds=tuple(self.rounds),
             train=tuple(self.train),
             held=tuple(self.held),
-            remaining={c: float(v) for c, v in remaining.items()},
+            remaining=self._remaining(final),
             findings=(*_small_faults(final), *final.train.warnings),
             unmodelled=unmodelled,
         )  # fmt: skip

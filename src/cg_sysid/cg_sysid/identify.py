@@ -28,9 +28,10 @@ from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknow
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
+STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CORRECTIONS = 4  # attempts to bring a step back to consistent lumps
-KEPT_SLACK = 0.1  # share of the distance from the border of consistency that a step must keep
+KEPT_SLACK = 0.1  # share of its distance from the border to which such a step is brought back
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
 
@@ -150,7 +151,9 @@ def fit(
                 'records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(point) if reweight else 1.0
-        if converged and abs(np.log(new / weight)) < 0.1:
+        # A minimum under weights that are about to change is none yet.
+        converged = converged and bool(abs(np.log(new / weight)) < STEADY)
+        if converged:
             break
         weight = new
     assert point is not None
@@ -255,11 +258,11 @@ def _kept_consistent(problem: Problem, theta: np.ndarray, to: np.ndarray) -> np.
     for _ in range(CORRECTIONS):
         values = problem.values(to)
         slack, jacobian = problem.consistency(values)
-        short = slack < KEPT_SLACK * inside
+        short = slack <= 0
         if not short.any():
             break
         across = (jacobian * problem.chain(values))[short] * scales
-        missing = 2 * KEPT_SLACK * inside[short] - slack[short]
+        missing = KEPT_SLACK * inside[short] - slack[short]
         to = to + scales * np.linalg.lstsq(across, missing, rcond=None)[0]
     return to
 

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
-from cg_sysid.candidates import Outcome, at_edge, chi2, own_parameters, strained
+from cg_sysid.candidates import (
+    Outcome,
+    at_edge,
+    chi2,
+    own_parameters,
+    strained,
+    too_small,
+)
 from cg_sysid.diagnosis import MARGIN, Candidate, effect_name, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.trial import Trial
@@ -124,7 +131,7 @@ class Jury:
         elif explained < MATERIAL:
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
-        reasons += at_edge(o)
+        reasons += at_edge(o) + too_small(o)
         return Candidate(
             label=o.label,
             model=o.train.model,

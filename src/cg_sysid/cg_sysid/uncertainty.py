@@ -58,7 +58,7 @@ def _own_sigmas(
     for own, cross, _ in point.own:
         moved = np.linalg.solve(own, cross)
         spread = np.linalg.inv(own) / rescale + moved @ shared @ moved.T
-        found.append(np.sqrt(np.diag(spread)[-count:]))
+        found.append(np.sqrt(np.maximum(np.diag(spread)[-count:], 0.0)))
     return tuple(found)
 
 
