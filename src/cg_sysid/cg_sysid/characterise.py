@@ -8,7 +8,7 @@
 docs/diagnosis.md says why.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,6 +33,9 @@ WORTH_SKETCHING = 0.97  # share of the error of other records that a sketch may 
 OWN_PHASES = 0.7  # share of the best other error to which phases of records' own must bring it
 WINDOW = 2.5  # pieces
 LEARNING_S = 40.0  # windows to learn from, all together; what is beyond adds little
+LONGEST_WINDOW = 1.25  # s
+STOOD_IN = 0.5  # share of the error that causes or a term must take from what is without them
+NEGLIGIBLE = 0.05  # chi2 per sample above the noise; less is not compared
 WORSE = 3.0  # times the error on windows that a fit of whole records may leave
 OUT_OF_RANGE = 0.15  # share of the range of its variable by which a function may miss it
 
@@ -62,6 +65,52 @@ def characterise(
     return _vibrating(base, terms[0], (train, held), run)
 
 
+def what_remains(
+    nominal: Outcome,
+    final: Outcome,
+    causes: Collection[str],
+    train: Sequence[Trial],
+    held: Sequence[Trial],
+    run: Run,
+) -> tuple[Unmodelled | None, bool]:
+    """What a model with causes leaves, as a learned term, and whether the causes stand.
+
+    An effect that the library lacks makes others look like it. If one learned term without the
+    causes is far better than the causes, and they are of no use beside it, they stood in for it.
+
+    Args:
+        nominal: The model without causes, fitted.
+        final: The model with them.
+        causes: Their labels.
+        train: Trials to learn from.
+        held: Trials that judge.
+        run: As in `characterise`.
+    """
+    beside = characterise(final, train, held, run)
+    alone = characterise(nominal, train, held, run) if causes else None
+    if alone is None or _causes_stand(final, alone, beside, held):
+        return beside, True
+    return replace(alone, nearest=tuple(sorted(causes))), False
+
+
+def _causes_stand(
+    final: Outcome, alone: Unmodelled, beside: Unmodelled | None, held: Sequence[Trial]
+) -> bool:
+    """Held-out errors with causes, with the term alone, and with both."""
+    both = (beside or alone).fit.model
+    if alone.window is None:
+        fits = [final.held, alone.held or final.held, (beside and beside.held) or final.held]
+    else:
+        length = min(u.window or LONGEST_WINDOW for u in (alone, beside or alone))
+        windows = [window for trial in held for window in cut(both, trial, length)]
+        models = (final.train.model, alone.fit.model, both)
+        fits = [score(_lasting_model(model), windows) for model in models]
+    with_causes, with_term, with_both = (
+        max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits
+    )
+    return with_term > STOOD_IN * with_causes or with_both < STOOD_IN * with_term
+
+
 def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[float, list[Term]]:
     """Length of a piece in s, and the terms that are worth a fit, best first."""
     pieces = pieces_of(task.model, train, held, task.bounds)
@@ -76,12 +125,16 @@ def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[f
 
 
 def _lasting(base: Outcome) -> Task:
+    """The base without what happened in single records."""
+    return Task(_lasting_model(base.model), bounds=base.task.bounds)
+
+
+def _lasting_model(model: Model) -> Model:
     """The model without what happened once in single records: that says nothing about a law."""
-    model = base.model
     for effect in model.effects:
         if any(p.each for p in effect.parameters):
             model = model.without_effect(effect.label)
-    return Task(model, bounds=base.task.bounds)
+    return model
 
 
 # --- a function that all records share --------------------------------------------------------

@@ -140,6 +140,8 @@ def print_leftover(console: Console, facts: Facts) -> None:
     """What an error above the noise looks like."""
     for channel, words in left_words(facts).items():
         console.print(f'  [bold]left in {channel}[/]: {words}', highlight=False)
+    if facts['unmodelled']:
+        console.print(f'  [bold]learned[/] {facts["unmodelled"]["label"]}', highlight=False)
 
 
 def print_causes(console: Console, facts: Facts) -> None:

@@ -3,7 +3,8 @@
     diagnose --model MODEL.yaml --out DIR BAG [BAG ...]
 
 Writes DIR/diagnosis.json, DIR/report.html, DIR/curves.npz and, where records could be used,
-DIR/model.yaml: the model with the causes in it.
+DIR/model.yaml: the model with the causes in it. What no cause explains is in DIR/learned.yaml: the
+same model with a learned term.
 """
 
 import argparse
@@ -30,6 +31,8 @@ from cg_sysid.provenance import provenance
 from cg_sysid.record import Record
 from cg_sysid.report import write_report
 
+MODEL = 'model.yaml'
+LEARNED = 'learned.yaml'
 COLOURS = {
     'consistent': 'green', 'explained': 'green', 'ambiguous': 'yellow', 'unexplained': 'magenta',
     'unusable': 'red',
@@ -225,10 +228,15 @@ def write_results(
     """Everything that a diagnosis leaves behind."""
     write_facts(facts, directory)
     curves.save(lines, directory, faults)
-    if answer is not None:
-        extended_model(answer, facts).save(directory / 'model.yaml')
-    else:
-        (directory / 'model.yaml').unlink(missing_ok=True)
+    models = {} if answer is None else {MODEL: extended_model(answer, facts)}
+    if answer is not None and answer.unmodelled is not None:
+        learned = answer.unmodelled.fit.model
+        models[LEARNED] = replace(learned, provenance=models[MODEL].provenance)
+    for name in (MODEL, LEARNED):
+        if name in models:
+            models[name].save(directory / name)
+        else:
+            (directory / name).unlink(missing_ok=True)
     write_report(directory)
 
 

@@ -16,13 +16,14 @@ from cg_description.model_file import write_atomically
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.curves import Curve
-from cg_sysid.diagnosis import Candidate, Cause, Diagnosis, Round
+from cg_sysid.diagnosis import Candidate, Cause, Diagnosis, Gain, Round, gains_of
 from cg_sysid.findings import Finding
 from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
 from cg_sysid.leftover import leftover
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import Unknown
+from cg_sysid.unmodelled import term_words, variable_words
 
 DIAGNOSIS = 'cg_diagnosis/1'
 IDENTIFICATION = 'cg_identification/1'
@@ -70,6 +71,7 @@ def diagnosis_facts(
             for channel, chi2 in diagnosis.remaining.items()
             if channel in {g.channel for g in diagnosis.gains}
         },
+        'unmodelled': _unmodelled(diagnosis),
         'ranking': [_round(r) for r in diagnosis.rounds],
         **_fitted(diagnosis.nominal, fit),
         'findings': list(diagnosis.findings),
@@ -94,6 +96,7 @@ def unusable_facts(
         'causes': [],
         'gain': {},
         'remaining_error': {},
+        'unmodelled': None,
         'ranking': [],
         'parameters': [
             _parameter(model, name, None) for name in model.declarations
@@ -160,6 +163,7 @@ def identification_facts(
             for (channel, _), a, n in zip(outputs, after, total, strict=True)
             if n
         },
+        'unmodelled': None,
         'ranking': [],
         **_fitted(model, fit),
         'findings': list(fit.warnings),
@@ -232,6 +236,50 @@ def _cause(cause: Cause, model: Model) -> Facts:
             for record, values in cause.events.items()
         },
     }
+
+
+def _unmodelled(diagnosis: Diagnosis) -> Facts | None:
+    found = diagnosis.unmodelled
+    if found is None:
+        return None
+    shape = found.shape
+    gains: tuple[Gain, ...] = ()
+    if found.held is not None:
+        gains = gains_of(diagnosis.nominal, diagnosis.held, diagnosis.extended.held, found.held)
+    return {
+        'label': found.label,
+        'text': found.text,
+        'what': term_words(found.effect),
+        'where': found.where,
+        'at': found.effect.site,
+        'follows': found.effect.follows,
+        'follows_words': variable_words(found.effect),
+        'unit': found.effect.unit,
+        'variable_unit': found.variable_unit,
+        'kind': found.effect.kind,
+        'parity': shape.parity or None,
+        'even_share': shape.even,
+        'period': None
+        if found.period is None
+        else {'value': found.period[0], 'sigma': found.period[1], 'unit': found.variable_unit},
+        'rms': shape.rms,
+        'peak': shape.peak,
+        'covered': list(shape.covered),
+        'mostly': None if shape.stretch is None else list(shape.stretch),
+        'amplitudes': found.amplitudes,
+        'function': {
+            's': shape.s, 'value': shape.value, 'sigma': shape.sigma, 'seen': shape.seen.tolist(),
+        },
+        'explained': found.explained,
+        'evidence_nats': found.evidence,
+        'significance': found.significance,
+        'window_s': found.window,
+        'rivals': [
+            {'label': rival.label, 'what': term_words(rival)} for rival in found.rivals
+        ],
+        'nearest': [_effect(label) for label in found.nearest],
+        'gain': {g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in gains},
+    }  # fmt: skip
 
 
 def _effect(label: str) -> Facts:

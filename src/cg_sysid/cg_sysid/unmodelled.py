@@ -43,9 +43,10 @@ class Unmodelled:
         explained: Share of the squared error above the noise that it removes on records held out:
             whole ones, or windows of them where `held` is None.
         window: Length in s of the windows on which terms were compared; None for whole records.
-        rivals: Labels of other terms that explain the records as well.
+        rivals: Other terms that explain the records as well.
         fit: The model with the term in it, identified.
         held: Score of that model on held-out records; None if only windows could be fitted.
+        nearest: Effects of the library that were taken for it until this term was tried.
     """
 
     effect: LearnedEffect
@@ -59,6 +60,7 @@ class Unmodelled:
     rivals: tuple[LearnedEffect, ...]
     fit: Fit = field(repr=False)
     held: Fit | None = field(repr=False)
+    nearest: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -85,6 +87,8 @@ class Unmodelled:
         if self.rivals:
             others = listed([term_words(rival) for rival in self.rivals], 'or')
             said += f' These records do not tell it from {others}.'
+        if self.nearest:
+            said += f' Of the library, {listed(list(self.nearest))} came nearest.'
         return said
 
     def _features(self) -> list[str]:

@@ -2,6 +2,7 @@
 
 import math
 
+from cg_sysid.report.function import unmodelled
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, left_words, parameter_words
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
@@ -24,6 +25,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
     verdict = facts['verdict']
     left = [
         *[_cause(cause) for cause in facts['causes']],
+        unmodelled(facts),
         _faults(facts, drawn),
         _where(facts),
         _left_out(facts),

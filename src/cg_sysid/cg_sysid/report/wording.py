@@ -40,9 +40,11 @@ def headline(facts: Facts) -> str:
         ]
         return f'The simulation lacks {"; and ".join(parts)}'
     if verdict == 'unexplained':
+        if facts['unmodelled']:
+            return f'The simulation lacks {facts["unmodelled"]["what"]}'
         worst = worst_channel(facts)
         at = f' in {worst}' if worst else ''
-        return f'There is an error{at} that no known effect explains'
+        return f'There is an error{at} that {_nothing_tried(facts)} explains'
     if verdict == 'unusable':
         bad, total = len(facts['unusable']), len(facts['sources'])
         if bad == total:
@@ -78,12 +80,18 @@ def lead(facts: Facts) -> str:
         return text
     if verdict == 'consistent':
         return f'On held-out recordings the error of {channel} is {left}.'
-    tried = facts['provenance'].get('options', {}).get('effects', 'all')
-    which = 'nothing in the library of effects' if tried == 'all' else f'no effect tried ({tried})'
-    return (
-        f'The simulation misses {channel} by {left} on held-out recordings, and {which} removes '
-        'that.'
+    text = (
+        f'The simulation misses {channel} by {left} on held-out recordings, and '
+        f'{_nothing_tried(facts)} explains that.'
     )
+    if facts['unmodelled']:
+        text += ' A learned function describes it:'
+    return text
+
+
+def _nothing_tried(facts: Facts) -> str:
+    tried = facts['provenance'].get('options', {}).get('effects', 'all')
+    return 'no known effect' if tried == 'all' else f'no effect tried ({tried})'
 
 
 def left_words(facts: Facts) -> dict[str, str]:
