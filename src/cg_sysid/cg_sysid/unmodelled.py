@@ -101,8 +101,9 @@ class Unmodelled:
         if self.amplitudes:
             found.append("with a phase of each record's own")
         if shape.stretch is not None:
-            low, high = (_quantity(end, self.variable_unit) for end in shape.stretch)
-            found.append(f'mostly from {low} to {high}')
+            factor, unit = scaled(max(map(abs, shape.stretch)), self.variable_unit)
+            low, high = (number(factor * end, 2) for end in shape.stretch)
+            found.append(f'mostly from {low} to {high} {unit}')
         return [
             *found,
             f'{_quantity(shape.rms, self.effect.unit)} RMS and '
