@@ -211,7 +211,7 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
         if best is None or settled.normalised_error < best.normalised_error:
             best = settled
         if best.normalised_error < SETTLED:
-            return best
+            return fit(model, train, start=best, bounds=task.bounds)
     assert best is not None
     found = bool(task.so_far) or best.normalised_error > WORTH_SEEKING * nothing
     return replace(best, converged=found)
