@@ -4,7 +4,7 @@
 
 The checks themselves are in clock.py and check_timing.py (stamps), check_signals.py and
 check_steps.py (single signals), check_kinematics.py (IMU against itself), check_dynamics.py
-(motion against torque), check_model.py (signs that only a model tells) and check_content.py
+(motion against torque), check_signs.py (signs of all channels together) and check_content.py
 (note, coverage, feedback).
 """
 
@@ -22,8 +22,8 @@ from cg_sysid.bags import RawRecording, parse_note, read_raw, to_record
 from cg_sysid.check_content import check_content
 from cg_sysid.check_dynamics import check_dynamics
 from cg_sysid.check_kinematics import check_kinematics
-from cg_sysid.check_model import mirrored_channel
-from cg_sysid.check_signals import Signal, check_signals, read_signals
+from cg_sysid.check_signals import check_signals, read_signals
+from cg_sysid.check_signs import check_signs
 from cg_sysid.check_steps import check_steps
 from cg_sysid.check_timing import check_timing
 from cg_sysid.clock import mend_clocks
@@ -66,8 +66,8 @@ def check_recording(
     findings += [*check_steps(raw, sane), *check_kinematics(sane)]
     sound = not any(finding.severity == 'error' for finding in findings)
     findings += check_dynamics(raw, signals, sound)
-    if model is not None and sound:
-        findings = _with_model(findings, raw, signals, Path(model))
+    robot, unreadable = _model(model)
+    findings += [*check_signs(raw, sane, robot), *unreadable]
     findings += check_content(raw, signals, model, use_region)
     if not any(finding.severity == 'error' for finding in findings):
         findings += _refused(raw)
@@ -82,17 +82,14 @@ def _setup_error(raw: RawRecording) -> Finding | None:
     return None
 
 
-def _with_model(
-    findings: list[Finding], raw: RawRecording, signals: dict[str, Signal], model: Path
-) -> list[Finding]:
-    """The findings with the sign that is wrong, where the model tells which."""
+def _model(path: str | Path | None) -> tuple[Model | None, list[Finding]]:
+    """The model in a file; without one, signs are compared as far as that goes."""
+    if path is None:
+        return None, []
     try:
-        mirrored = mirrored_channel(raw, signals, Model.load(model))
+        return Model.load(path), []
     except ValueError as error:
-        return [*findings, Finding('model_unreadable', 'info', '', str(error))]
-    if mirrored is None:
-        return findings
-    return [*(f for f in findings if f.code != 'sign_error' or f.start_s is not None), mirrored]
+        return None, [Finding('model_unreadable', 'info', '', str(error))]
 
 
 def _refused(raw: RawRecording) -> list[Finding]:

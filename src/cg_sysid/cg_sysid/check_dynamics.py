@@ -1,14 +1,12 @@
 """Checks of the motion against the torque, by the law that the recording itself shows (law.py).
 
-* The torque's factor is an inverse inertia: where it is negative, torque or angle has the wrong
-  sign.
 * The law holds from the first second to the last: where it does not, but does once a sign is
   turned or stamps are spread, that is the fault.
 * A torque that jumps is answered by the joint: where it is not, the zero of its record moved.
 * A torque that runs along a limit is one: where the joint answers more, its record is clipped.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,17 +20,17 @@ from cg_sysid.record import NS_PER_S
 from cg_sysid.steps import find_step
 from cg_sysid.torque_gaps import over_gap
 
-WRONG_SIGN = -8.0  # factor of the torque over its standard error, [1]
-SHARE = 0.05  # a torque that does less of the acceleration than this has no sign to tell, [1]
 DRIVEN = 0.25  # torque over the largest of the machine: a joint with less is not driven, [1]
 AUDIBLE = 10.0  # torque over its noise: what a motor measures at rest answers the motion, [1]
 BROKEN = 0.2  # share of the acceleration that no one law leaves in a sound recording, [1]
+HOLDS = 0.1  # and what one law leaves where it holds, [1]
 RESTORED = 0.25  # the fault is found if without it this share of that is left, [1]
 MISALIGNED = 0.5  # the same for a topic that ends before the others, [1]
-CHANGED = 0.5  # two laws in place of one leave less than this share, [1]
+CHANGED = 0.5  # the law of a part leaves less than this share of what that of all leaves, [1]
 PLACES = 40  # instants that are tried
-SPLITS = 8  # of them, at which two laws are tried first
-FEWEST = 40  # averages for one of them
+SPLITS = 8  # of them, at which the parts are tried first
+FEWEST = 40  # averages in a part
+RATHER = 2.0  # a torque turns rather than an angle, which would jump: leaves at most this more
 RATES = (2, 3, 4, 5, 10)  # ratios of sampling rates that are tried
 MOVED = 6.0  # standard errors of a term that makes a fault, [1]
 ANSWERED = 5.0  # standard errors of an answer to what a record does not show, [1]
@@ -59,10 +57,9 @@ def check_dynamics(
         return
     for torque in known.input_names:
         angle = joint_of(torque)
-        if angle not in motion.angle or not _drives(wanted, torque):
+        if angle not in motion.angle or not drives(wanted, torque):
             continue
         law = fit_law(motion, torque, angle)
-        yield from _sign(raw, motion, torque, angle, law)
         broken = list(_broken(raw, wanted, motion, torque, angle, law)) if sound else []
         yield from broken
         if not broken:
@@ -70,41 +67,13 @@ def check_dynamics(
             yield from _clipped(wanted, motion, torque, angle)
 
 
-def _drives(signals: dict[str, Signal], torque: str) -> bool:
+def drives(signals: Mapping[str, Signal], torque: str) -> bool:
     """Whether a torque is there, and makes the motion rather than follows from it."""
     rms = {n: float(np.std(s.values)) for n, s in signals.items() if n.endswith('torque')}
     if rms.get(torque, 0.0) == 0.0:
         return False
     noise = signals[torque].noise.sigma_floor
     return rms[torque] > max(DRIVEN * max(rms.values()), AUDIBLE * noise)
-
-
-def _sign(
-    raw: RawRecording, motion: Motion, torque: str, angle: str, law: Law
-) -> Iterator[Finding]:
-    imu = 'imu_angle'
-    if angle == 'hip_angle' and raw.setup.fixture == 'outer_fixed' and imu in motion.angle:
-        # Two sensors of one angle, and the torque: the odd one out is wrong.
-        same = float(np.corrcoef(motion.angle[angle], motion.angle[imu])[0, 1])
-        if same < -0.9:
-            wrong = imu if fit_law(motion, torque, imu).factor < 0 else angle
-            yield Finding('sign_error', 'error', wrong, f'{angle} and {imu} are one angle while '
-                          'the outer legs are fixed, but have opposite signs', value=same,
-                          allowed=1.0)
-            return
-        if _wrong(law):
-            yield Finding('sign_error', 'error', torque, f'drives both {angle} and {imu} the '
-                          'wrong way', value=law.factor, allowed=abs(law.factor))
-            return
-    if _wrong(law):
-        for channel, other in ((angle, torque), (torque, angle)):
-            yield Finding('sign_error', 'error', channel, f'{torque} drives {angle} the wrong '
-                          f'way: this channel has the wrong sign, or {other}', value=law.factor,
-                          allowed=abs(law.factor))
-
-
-def _wrong(law: Law) -> bool:
-    return law.factor < WRONG_SIGN * law.error and law.share > SHARE
 
 
 def _broken(
@@ -122,12 +91,13 @@ def _broken(
         for group in groups:
             for at in _places(motion):
                 rest = _left(motion.mirrored(group, at), torque, angle, at)
+                rest = rest / RATHER if group[0] == torque else rest
                 best = min(best, (rest, 'sign_error', group[0], at))
         for ratio in RATES:
             for at in _places(motion):
                 rest = _spread_out(signals, tuple(signals), torque, angle, at, ratio)
                 best = min(best, (rest, 'sampling_rate_change', '', at))
-        if best[0] < RESTORED * law.unexplained:
+        if best[0] < min(RESTORED * law.unexplained, HOLDS):
             yield _restored(*best[1:], law.unexplained, best[0])
             return
     for topic, short in _short_topics(raw, signals).items():
@@ -164,15 +134,15 @@ def _left(motion: Motion, torque: str, angle: str, at: float) -> float:
 
 
 def _changes(motion: Motion, torque: str, angle: str, law: Law) -> bool:
-    """Whether one law before some instant and another one after it say much more than one."""
+    """Whether a part of the recording follows a law that the whole does not."""
     for at in _places(motion)[::PLACES // SPLITS]:
         rows = motion.away_from(at)
-        parts = [rows & (motion.time < at), rows & (motion.time > at)]
-        if min(part.sum() for part in parts) < FEWEST:
-            continue
-        left = max(fit_law(motion, torque, angle, rows=part).unexplained for part in parts)
-        if left < CHANGED * law.unexplained:
-            return True
+        for part in (rows & (motion.time < at), rows & (motion.time > at)):
+            if part.sum() < FEWEST:
+                continue
+            left = fit_law(motion, torque, angle, rows=part).unexplained
+            if left < CHANGED * law.unexplained:
+                return True
     return False
 
 

@@ -1,10 +1,9 @@
 """Checks of the IMU against itself: its rate must be the derivative of its angle.
 
-This is kinematics; no model of the robot is needed. Whether an encoder, a torque or an IMU as a
-whole has the wrong sign is not decidable this way: see check_dynamics.py.
+This is kinematics; no model of the robot is needed. Signs are compared in check_signs.py.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ from cg_sysid.findings import Finding
 from cg_sysid.steps import find_step
 
 WINDOW_S = 0.1  # angles are compared with integrated rates over spans of this length, in s
-BIAS_WINDOW_S = 0.4  # and over spans of this length where the zero of the rate is in question
+BIAS_WINDOW_S = 0.25  # and over spans of this length where the zero of the rate is in question
 SCALE_TOLERANCE = 0.2  # of the rate against the derivative of the angle, [1]
 SCALE_CHANGE = 1.3  # ratio of that scale before and after that only wrong stamps make, [1]
 CORRELATED = 0.7  # below this correlation nothing is said about sign and scale, [1]
@@ -62,15 +61,11 @@ class Imu:
 
 def check_kinematics(signals: dict[str, Signal]) -> Iterator[Finding]:
     """Findings about the IMU's angle against its rate."""
-    if 'imu_angle' not in signals or 'imu_rate' not in signals:
+    imu = _read(signals)
+    if imu is None:
         return
-    imu = _read(signals['imu_angle'], signals['imu_rate'])
-    span = imu.steps(WINDOW_S) if len(imu.time) else 0
-    if len(imu.time) < max(50, 4 * span):
-        return
-    turned = imu.values[span:] - imu.values[:-span]
-    integrated = imu.integral[span:] - imu.integral[:-span]
-    moves = np.std(integrated) > 5.0 * imu.noise and np.std(turned) > 2.0 * imu.noise
+    turned, integrated, span = _turned(imu)
+    moves = _moves(imu, turned, integrated)
     scale = 1.0
     if moves:
         change = _change_of_scale(imu, turned, integrated, span)
@@ -79,10 +74,7 @@ def check_kinematics(signals: dict[str, Signal]) -> Iterator[Finding]:
             return
         correlation = float(np.corrcoef(turned, integrated)[0, 1])
         if correlation < -CORRELATED:
-            yield Finding('sign_error', 'error', 'imu_rate',
-                          f'the rate has the opposite sign of the derivative of imu_angle '
-                          f'(correlation {correlation:.2f})', value=correlation, allowed=1.0)
-            return
+            return  # one of the two has the wrong sign: check_signs.py
         if correlation > CORRELATED:
             scale = 1.0 / _slope(integrated, turned)
             yield from _scale(scale)
@@ -95,16 +87,46 @@ def check_kinematics(signals: dict[str, Signal]) -> Iterator[Finding]:
                         imu.noise))
     yield from stuck
     if not stuck:
-        yield from _shift_of_angle(imu, imu.integral / scale)
-        yield from _shift_of_rate(imu, moves)
+        shifts = list(_shift_of_rate(imu, moves))
+        yield from shifts or _shift_of_angle(imu, imu.integral / scale)
 
 
-def _read(angle: Signal, rate: Signal) -> Imu:
+def agreement_of_imu(signals: Mapping[str, Signal]) -> float:
+    """Correlation of the IMU's angle with its integrated rate; 0 where there is none to tell."""
+    imu = _read(signals)
+    if imu is None:
+        return 0.0
+    turned, integrated, _ = _turned(imu)
+    if not _moves(imu, turned, integrated):
+        return 0.0
+    return float(np.corrcoef(turned, integrated)[0, 1])
+
+
+def _read(signals: Mapping[str, Signal]) -> Imu | None:
+    if 'imu_angle' not in signals or 'imu_rate' not in signals:
+        return None
+    angle, rate = signals['imu_angle'], signals['imu_rate']
     time, at_angle, at_rate = np.intersect1d(angle.time, rate.time, return_indices=True)
+    if len(time) < 50:
+        return None
     speed = rate.values[at_rate]
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))])
-    return Imu(angle, rate, time, angle.values[at_angle], speed, integral,
-               angle.sample[at_angle])
+    imu = Imu(angle, rate, time, angle.values[at_angle], speed, integral, angle.sample[at_angle])
+    return imu if len(time) >= 4 * imu.steps(WINDOW_S) else None
+
+
+def _turned(imu: Imu) -> tuple[np.ndarray, np.ndarray, int]:
+    """How far the angle turns over each span, and by its rate, in rad; samples in a span."""
+    span = imu.steps(WINDOW_S)
+    return (
+        imu.values[span:] - imu.values[:-span],
+        imu.integral[span:] - imu.integral[:-span],
+        span,
+    )
+
+
+def _moves(imu: Imu, turned: np.ndarray, integrated: np.ndarray) -> bool:
+    return bool(np.std(integrated) > 5.0 * imu.noise and np.std(turned) > 2.0 * imu.noise)
 
 
 def _slope(x: np.ndarray, y: np.ndarray) -> float:
@@ -188,11 +210,13 @@ def _shift_of_rate(imu: Imu, moves: bool) -> Iterator[Finding]:
     columns = [np.ones(len(at)), np.linspace(-1.0, 1.0, len(at))]
     if moves:  # a wrong scale, and a delay between angle and rate
         columns += [integrated / elapsed, faster / elapsed]
-    if len(at) < len(columns) + 1 + FREEDOM:
+    if len(at) < len(columns) + 3 + FREEDOM:
         return
     best = (0.0, 0.0, 0)
-    for k in range(BIAS_SIDE, len(at) - BIAS_SIDE + 1):
-        design = np.column_stack([*columns, np.arange(len(at)) >= k])
+    for k in range(BIAS_SIDE + 2, len(at) - BIAS_SIDE + 1):
+        # The span in which it moves counts for neither side, in both differences that it is in.
+        moving = np.eye(len(at))[k - 2: k]
+        design = np.column_stack([*columns, *moving, np.arange(len(at)) >= k])
         inverse = np.linalg.pinv(design)
         solution = inverse @ excess
         rest = excess - design @ solution
@@ -203,8 +227,9 @@ def _shift_of_rate(imu: Imu, moves: bool) -> Iterator[Finding]:
     score, size, k = best
     if score < SHIFTED:
         return
-    k = _bend(imu, int(at[k]), span)
-    yield Finding('zero_shift', 'error', imu.rate.channel,
+    k = _bend(imu, int(at[k - 1]), span)
+    grave = abs(size) > imu.rate.noise.sigma_floor
+    yield Finding('zero_shift', 'error' if grave else 'warning', imu.rate.channel,
                   f'changes by {size:.3g} rad/s against the derivative of imu_angle, and stays '
                   'so', float(imu.time[k]), float(imu.time[k]), int(imu.sample[k]), size,
                   SHIFTED * abs(size) / score)

@@ -64,7 +64,7 @@ def _mirrored(step: Step) -> bool:
     """Value and rate go on with the opposite sign."""
     turned = abs(step.rate_before + step.rate_after)
     straight = abs(step.rate_before - step.rate_after)
-    near = SURE * step.sigma + MIRRORED * abs(step.size)
+    near = step.limit + MIRRORED * abs(step.size)
     return abs(step.before + step.after) < near and turned < straight
 
 

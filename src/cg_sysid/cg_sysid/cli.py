@@ -140,7 +140,7 @@ def print_leftover(console: Console, facts: Facts) -> None:
     """What an error above the noise looks like."""
     for channel, words in left_words(facts).items():
         console.print(f'  [bold]left in {channel}[/]: {words}', highlight=False)
-    if facts['unmodelled']:
+    if facts.get('unmodelled'):
         console.print(f'  [bold]learned[/] {facts["unmodelled"]["label"]}', highlight=False)
 
 

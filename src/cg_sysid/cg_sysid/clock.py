@@ -32,7 +32,7 @@ SIDE = 12  # samples that predict the next ones
 AHEAD = 5  # samples that are predicted, as their mean
 TICKING = 1e-3  # spread of the spacings of a clock in hardware, [1]
 FLOOR = 15  # arrivals whose earliest is the delay of the recorder without hold-ups
-SURE = 7.0  # log odds beyond which a jump counts as such: 1000 to 1
+SURE = 5.0  # log odds beyond which a jump counts as such: 150 to 1
 WITNESS = 15.0  # log odds that one witness can add at most
 WORST = 8.0  # prediction errors in standard deviations beyond which nothing more is learnt
 
@@ -283,9 +283,12 @@ def _starts_with_others(topics: dict[str, RawTopic], jump: Jump) -> bool:
 
 
 def _without(topic: RawTopic, jump: Jump) -> RawTopic:
-    stamp = topic.stamp_ns.copy()
-    stamp[jump.sample:] -= jump.excess_ns
-    return replace(topic, stamp_ns=stamp)
+    later = np.arange(len(topic)) >= jump.sample
+    stamp = topic.stamp_ns - jump.excess_ns * later
+    # Where nobody noted the arrivals, they are the stamps once more.
+    follows = not independent_arrivals(topic)
+    arrival = topic.log_ns - jump.excess_ns * later if follows else topic.log_ns
+    return replace(topic, stamp_ns=stamp, log_ns=arrival)
 
 
 def _finding(jump: Jump, topic: RawTopic, origin: int, repaired: bool) -> Finding:

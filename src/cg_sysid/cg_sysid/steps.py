@@ -71,8 +71,7 @@ def find_step(
     if len(grid) < 4 * spans[-1] or len(grid) > 2 * len(time):
         return None
     holes = np.flatnonzero(spacing > HOLE * usual)
-    width = 2 * spans[0] + 1
-    moved = np.abs(np.convolve(np.gradient(sampled), np.ones(width) / width, 'same'))
+    moved = _usual_move(sampled, 2 * spans[0] + 1)
     score = np.zeros((len(spans), len(grid)))
     size = np.zeros_like(score)
     for i, span in enumerate(spans):
@@ -158,6 +157,12 @@ def _distance(values: np.ndarray, span: int) -> np.ndarray:
     distance = np.zeros(len(values))
     distance[span: len(values) - span + 1] = np.correlate(values, weights, 'valid')
     return distance
+
+
+def _usual_move(values: np.ndarray, width: int) -> np.ndarray:
+    """How far a signal moves from sample to sample around each, a step left out, shape (M,)."""
+    moved = np.pad(np.diff(values), (width // 2, width // 2 + 1), mode='edge')
+    return np.abs(np.median(np.lib.stride_tricks.sliding_window_view(moved, width), axis=1))
 
 
 def _usual(distance: np.ndarray, span: int) -> np.ndarray:

@@ -10,14 +10,14 @@ from cg_sysid.report.wording import Facts
 from cg_sysid.text import number, scaled
 
 WIDTH, HEIGHT = 460, 230
-LEFT, RIGHT, TOP, BOTTOM = 54, 8, 10, 40
+LEFT, RIGHT, TOP, BOTTOM = 54, 8, 24, 40
 BAND = 1.96  # standard deviations: 95 %
 TICKS = 5
 
 
 def unmodelled(facts: Facts) -> Markup | None:
     """The card of what no effect explains; None where there is no such term."""
-    term = facts['unmodelled']
+    term = facts.get('unmodelled')
     if term is None:
         return None
     title = 'What no effect explains' if not facts['causes'] else 'What remains'
@@ -29,13 +29,31 @@ def unmodelled(facts: Facts) -> Markup | None:
         tag('h3', title),
         tag('p', term['text']),
         picture(term),
-        tag('p', 'Learned function (line), its 95 % band and where there are recordings (shaded). '
-            'It is no cause but a description; learned.yaml is the model with it.',
+        tag('p', 'Learned function (line), its 95 % band, where there are recordings (shaded)',
+            ', one period.' if term['period'] else '.',
+            ' It is no cause but a description; learned.yaml is the model with it.',
             class_='soft small'),
+        _gain(term),
         tag('p', tag('span', term['label'], class_='mono soft'), class_='small'),
         rivals,
         class_='card', id='unmodelled',
     )  # fmt: skip
+
+
+def _gain(term: Facts) -> Markup | None:
+    """The error with the term in the model, where it was most above the noise."""
+    if not term['gain']:
+        return None
+    channel = max(term['gain'], key=lambda c: _above_noise(term['gain'][c]))
+    gain = term['gain'][channel]
+    factor, unit = scaled(gain['before'], gain['unit'])
+    before, after = (number(factor * gain[key]) for key in ('before', 'after'))
+    return tag('p', f'With it the error of {channel} on held-out recordings falls from {before} to '
+               f'{after} {unit}.', class_='soft small')  # fmt: skip
+
+
+def _above_noise(gain: Facts) -> float:
+    return (gain['before'] or 0.0) / (gain['noise_floor'] or 1.0)
 
 
 def picture(term: Facts) -> Markup:
@@ -49,8 +67,8 @@ def picture(term: Facts) -> Markup:
     # A band that nothing holds must not flatten what is known.
     widest = max(abs(y) + BAND * e for y, e in zip(g, sigma, strict=True))
     top = 1.25 * max(size, min(2 * size, widest))
-    low = -top if min(g) < 0 else -0.1 * top
-    high = top if max(g) > 0 else 0.1 * top
+    low = -top if min(g) < -0.1 * size else -0.15 * top
+    high = top if max(g) > 0.1 * size else 0.15 * top
 
     def x(value: float) -> float:
         return LEFT + (value - s[0]) / (s[-1] - s[0]) * (WIDTH - LEFT - RIGHT)
@@ -76,7 +94,7 @@ def picture(term: Facts) -> Markup:
         tag('path', d=path(list(zip(s, g, strict=True))), class_='curve'),
         tag('text', f'{term["follows_words"]} [{across_unit or "1"}]',
             x=(LEFT + WIDTH - RIGHT) / 2, y=HEIGHT - 6, text_anchor='middle', class_='label'),
-        tag('text', unit or '1', x=4, y=TOP + 10, class_='label'),
+        tag('text', unit or '1', x=4, y=TOP - 10, class_='label'),
     ]  # fmt: skip
     return tag('svg', parts, viewBox=f'0 0 {WIDTH} {HEIGHT}', role='img', class_='function',
                aria_label=term['text'])  # fmt: skip

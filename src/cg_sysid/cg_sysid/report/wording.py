@@ -40,7 +40,7 @@ def headline(facts: Facts) -> str:
         ]
         return f'The simulation lacks {"; and ".join(parts)}'
     if verdict == 'unexplained':
-        if facts['unmodelled']:
+        if facts.get('unmodelled'):
             return f'The simulation lacks {facts["unmodelled"]["what"]}'
         worst = worst_channel(facts)
         at = f' in {worst}' if worst else ''
@@ -84,8 +84,8 @@ def lead(facts: Facts) -> str:
         f'The simulation misses {channel} by {left} on held-out recordings, and '
         f'{_nothing_tried(facts)} explains that.'
     )
-    if facts['unmodelled']:
-        text += ' A learned function describes it:'
+    if facts.get('unmodelled'):
+        text += ' A learned function describes it.'
     return text
 
 
@@ -104,7 +104,8 @@ def left_words(facts: Facts) -> dict[str, str]:
         frequency = error.get('median_frequency_hz')
         if frequency:
             words.append(f'half of its power below {number(frequency, 2)} Hz')
-        follows = error.get('follows') or {}
+        # A learned term says it better.
+        follows = {} if facts.get('unmodelled') else error.get('follows') or {}
         name = followed(follows)
         if name:
             share, hint = f'{100 * follows[name]:.0f} %', HINTS.get(name, HINTS['torque'])

@@ -1,0 +1,241 @@
+"""Checks of recordings of the simulated robot: each fault is named where it was put, none where
+there is none, whatever physics is hidden in the machine. Rates over many: bench/check_rates.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_sysid import spoil
+from cg_sysid.bags import read_bag, to_record, write_bag
+from cg_sysid.check import check_recording
+from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import load_experiment
+from cg_sysid.intake import take_in
+from cg_sysid.rehearse import rehearse
+
+MODEL = model_path('compass_gait_mit')
+SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',
+           'swing_outer_fixed')
+SECONDS = 6.0
+AT = 3.217  # s, where faults set in
+NEAR = 0.2  # s by which a place may be off: averages of check_dynamics.py are this long
+TOPICS = ('/applied_torque', '/imu', '/hip_encoder', spoil.ALL)
+
+
+def machine_of(effect='', **values):
+    """The robot with numbers 10 % off, and an effect that nobody told."""
+    nominal = Model.load(MODEL)
+    factors = {'c1': 1.1, 'c2': 0.9, 'c4': 0.9, 'c5': 0.92, 'viscous_friction.coefficient': 1.15}
+    model = nominal.with_values({n: nominal.values[n] * f for n, f in factors.items()})
+    return model.with_effect(effect, None, **values) if effect else model
+
+
+def record_of(machine, name, seed):
+    e = load_experiment(name)
+    signal = make_signal(ExcitationSettings(**e.excitation, duration=SECONDS, seed=seed))
+    return rehearse(name, machine, e.setup, e.initial_state, [signal], SECONDS, seed=seed)
+
+
+@pytest.fixture(scope='module')
+def sound():
+    """Set-up -> a sound recording."""
+    machine = machine_of()
+    return {
+        name: spoil.as_recorded(record_of(machine, name, seed), seed)
+        for seed, name in enumerate(SET_UPS)
+    }
+
+
+def findings(raw, code, arrivals=True):
+    report = check_recording(raw if arrivals else spoil.without_arrivals(raw), MODEL)
+    return report, report.of(code)
+
+
+HIDDEN = {
+    'backlash': {'gap': 0.03, 'rotor_inertia': 0.1},
+    'torque_saturation': {'limit': 7.0},
+    'sensor_delay': {'delay': 0.02},
+    'cogging_torque': {'amplitude': 1.2, 'cycles': 40.0, 'phase': 1.0},
+    'external_push': {'impulse': 4.0, 'instant': 3.0, 'duration': 0.05},
+    'encoder_scale': {'error': -0.06},
+    'encoder_eccentricity': {'amplitude': 0.03, 'phase': 1.0},
+    'joint_flexibility': {'stiffness': 150.0, 'rotor_inertia': 0.2, 'damping': 0.3},
+    'imu_mount_flexibility': {'compliance': 1e-3, 'frequency': 40.0, 'damping_ratio': 0.03},
+    'gyro_scale': {'error': 0.1},
+    'friction_drift': {'excess': 1.5, 'time_constant': 2.0},
+    'actuator_lag': {'time_constant': 0.04},
+}
+
+
+@pytest.mark.parametrize('effect', ['', *HIDDEN])
+def test_physics_is_no_fault(effect):
+    machine = machine_of(effect, **HIDDEN.get(effect, {}))
+    for seed, name in ((20, 'spring_stabilised_inner'), (21, 'swing_outer_fixed')):
+        report = check_recording(spoil.as_recorded(record_of(machine, name, seed), seed), MODEL)
+        assert report.verdict != 'unusable', (name, report.findings[0])
+
+
+@pytest.mark.parametrize('set_up', SET_UPS)
+@pytest.mark.parametrize(('channel', 'size'), [
+    ('hip_angle', 0.005), ('imu_angle', 0.005), ('imu_rate', 0.02), ('hip_torque', 1.0),
+    ('hip_angle', -0.1), ('imu_angle', -0.1), ('imu_rate', -0.2), ('hip_torque', -5.0),
+])
+def test_a_zero_that_moves_is_found(sound, set_up, channel, size):
+    report, found = findings(spoil.shifted(channel, size, AT)(sound[set_up]), 'zero_shift')
+    assert report.verdict == 'unusable'
+    assert found[0].where == channel
+    assert found[0].start_s == pytest.approx(AT, abs=NEAR)
+    assert found[0].value == pytest.approx(size, rel=0.25)
+
+
+# Signs that go together and that nothing tells from the rest: with one free angle the mirror
+# image of angle and torque is the same motion.
+OPEN = {
+    ('swing_inner_fixed', 'hip_angle'): {'hip_angle', 'hip_torque'},
+    ('swing_inner_fixed', 'hip_torque'): {'hip_angle', 'hip_torque'},
+}
+
+
+@pytest.mark.parametrize('set_up', SET_UPS)
+@pytest.mark.parametrize('channel', ['hip_angle', 'imu_angle', 'imu_rate', 'hip_torque'])
+def test_a_wrong_sign_is_found(sound, set_up, channel):
+    if channel.startswith('imu') and set_up == 'swing_inner_fixed':
+        pytest.skip('the IMU is at rest: its sign is that of noise')
+    report, found = findings(spoil.mirrored((channel,))(sound[set_up]), 'sign_error')
+    assert report.verdict == 'unusable'
+    assert {f.where for f in found} == OPEN.get((set_up, channel), {channel})
+    report, found = findings(spoil.mirrored((channel,), AT)(sound[set_up]), 'sign_error')
+    assert report.verdict == 'unusable'
+    assert found[0].start_s == pytest.approx(AT, abs=NEAR)
+
+
+@pytest.mark.parametrize('set_up', ['spring_stabilised_inner', 'spring_stabilised_outer'])
+def test_an_imu_mounted_the_wrong_way_round_is_found_by_the_model(sound, set_up):
+    spoilt = spoil.mirrored(('imu_angle', 'imu_rate'))(sound[set_up])
+    report, found = findings(spoilt, 'sign_error')
+    assert {f.where for f in found} == {'imu_angle', 'imu_rate'}
+    assert check_recording(spoilt).verdict != 'unusable'  # without a model nobody can tell
+
+
+@pytest.mark.parametrize('set_up', SET_UPS)
+@pytest.mark.parametrize('channel', ['hip_angle', 'imu_angle', 'imu_rate', 'hip_torque'])
+def test_flat_tops_are_found(sound, set_up, channel):
+    if set_up == 'swing_inner_fixed' and channel.startswith('imu'):
+        pytest.skip('the IMU is at rest')
+    report, found = findings(spoil.clipped(channel, 0.9)(sound[set_up]), 'sensor_clipping')
+    assert report.verdict == 'unusable'
+    assert {f.where for f in found} == {channel}
+
+
+def test_a_torque_that_really_ends_at_a_limit_is_no_fault():
+    machine = machine_of('torque_saturation', limit=7.0)
+    raw = spoil.as_recorded(record_of(machine, 'swing_outer_fixed', 5), 5)
+    torque = raw.topics['/applied_torque'].values['hip_torque']
+    limit = 1.0 - float(np.mean(np.abs(torque) > 7.0))
+    report, found = findings(spoil.clipped('hip_torque', limit)(raw), 'sensor_clipping')
+    assert not found
+    assert report.of('saturation')
+
+
+@pytest.mark.parametrize(('topic', 'size', 'set_up'), [
+    (topic, size, SET_UPS[(i + k) % len(SET_UPS)])
+    for i, topic in enumerate(TOPICS)
+    for k, size in enumerate([0.003, -0.003, 0.05, -0.05, 0.5, -0.5])
+])
+def test_a_clock_that_jumps_is_put_right(sound, topic, size, set_up):
+    raw = sound[set_up]
+    whole = to_record(raw)
+    for arrivals in (True, False):
+        # Of one topic alone, a jump by a sample and a half at slow motion needs the arrivals.
+        if not arrivals and abs(size) < 0.01 and topic != spoil.ALL:
+            continue
+        spoilt = spoil.jumped(topic, size, AT)(raw)
+        report, found = findings(spoilt, 'clock_jump', arrivals)
+        assert report.verdict == 'warnings'
+        assert found[0].repair
+        assert found[0].value == pytest.approx(size, abs=1e-6)
+        assert found[0].start_s == pytest.approx(AT + min(size, 0.0), abs=0.005)
+        mended = to_record(spoilt if arrivals else spoil.without_arrivals(spoilt))
+        np.testing.assert_array_equal(mended.stamp_ns, whole.stamp_ns)
+        for channel, values in whole.outputs.items():
+            np.testing.assert_array_equal(mended.outputs[channel], values)
+
+
+@pytest.mark.parametrize(('topic', 'ratio', 'set_up'), [
+    (topic, ratio, SET_UPS[(i + k) % len(SET_UPS)])
+    for i, topic in enumerate(TOPICS) for k, ratio in enumerate([2, 5])
+])
+def test_a_change_of_rate_is_harmless_only_with_right_stamps(sound, topic, ratio, set_up):
+    raw = sound[set_up]
+    report, found = findings(spoil.decimated(topic, ratio, AT)(raw), 'sampling_rate_change')
+    assert report.verdict == 'warnings'
+    assert found[0].start_s == pytest.approx(AT, abs=NEAR)
+    if set_up == 'swing_inner_fixed' and topic == '/imu':
+        return  # at rest it may report whenever it likes
+    for arrivals in (True, False):
+        spoilt = spoil.decimated(topic, ratio, AT, honest=False)(raw)
+        report, found = findings(spoilt, 'sampling_rate_change', arrivals)
+        assert report.verdict == 'unusable'
+        assert any(f.start_s == pytest.approx(AT, abs=NEAR) for f in found)
+
+
+@pytest.mark.parametrize('topic', TOPICS)
+@pytest.mark.parametrize('set_up', ['spring_stabilised_outer', 'swing_inner_fixed'])
+def test_lost_samples_are_told(sound, set_up, topic):
+    raw = sound[set_up]
+    for fault in (spoil.thinned(topic, 0.02, 1), spoil.interrupted(topic, 0.05, AT)):
+        report, found = findings(fault(raw), 'dropped_samples')
+        assert report.verdict == 'warnings'
+        assert found[0].repair
+    if set_up == 'swing_inner_fixed' and topic == '/imu':
+        return  # at rest no sample is missed
+    for fault in (spoil.thinned(topic, 0.02, 1, honest=False),
+                  spoil.interrupted(topic, 0.05, AT, honest=False)):
+        report, found = findings(fault(raw), 'dropped_samples')
+        assert report.verdict == 'unusable'
+
+
+def test_a_torque_that_is_missing_for_long_is_not_made_up(sound):
+    spoilt = spoil.interrupted('/applied_torque', 0.5, AT)(sound['swing_outer_fixed'])
+    report, found = findings(spoilt, 'dropped_samples')
+    assert report.verdict == 'unusable'
+    assert found[0].start_s == pytest.approx(AT, abs=0.005)
+
+
+@pytest.mark.parametrize('length', [0.004, 0.02, 0.1])
+def test_a_torque_that_is_missing_for_short_is_filled(sound, length):
+    raw = sound['spring_stabilised_inner']
+    whole, spoilt = to_record(raw), spoil.interrupted(spoil.ALL, length, AT)(raw)
+    filled = to_record(spoilt)
+    np.testing.assert_array_equal(filled.stamp_ns, whole.stamp_ns)
+    torque = whole.inputs['hip_torque']
+    # A cubic over h s misses a sine of amplitude A by A (omega h)^4 / 384 in its middle; up to
+    # 2.5 Hz, with 7 N m RMS, and slopes over one sample of 2 ms.
+    omega = 2 * np.pi * 2.5
+    bound = 14.0 * ((omega * length) ** 4 / 384 + omega**2 * length * 0.002 / 4)
+    assert np.abs(filled.inputs['hip_torque'] - torque).max() < bound
+
+
+def test_a_fault_in_a_bag_is_told_where_the_bag_is_taken_in(tmp_path):
+    record = record_of(machine_of(), 'spring_stabilised_outer', 3)
+    later = record.time > AT
+    shifted = replace(record, outputs={
+        **record.outputs, 'imu_angle': record.outputs['imu_angle'] + 0.005 * later,
+    })
+    jumped = replace(record, stamp_ns=record.stamp_ns + np.where(later, 40_000_000, 0))
+    paths = [
+        write_bag(tmp_path / name, spoilt)
+        for name, spoilt in {'shifted': shifted, 'jumped': jumped}.items()
+    ]
+    intake = take_in(paths, MODEL)
+    (unusable,) = intake.left_out
+    assert unusable.name == 'shifted'
+    assert 'imu_angle 3.2' in unusable.reason
+    assert [f.code for f in unusable.faults] == ['zero_shift']
+    used = next(source for source in intake.sources if source.name == 'jumped')
+    assert {f.code for f in used.check.findings if f.repair} == {'clock_jump'}
+    np.testing.assert_array_equal(read_bag(paths[1]).stamp_ns, record.stamp_ns)
