@@ -23,7 +23,7 @@ from cg_sysid.torque_gaps import over_gap
 DRIVEN = 0.25  # torque over the largest of the machine: a joint with less is not driven, [1]
 AUDIBLE = 10.0  # torque over its noise: what a motor measures at rest answers the motion, [1]
 BROKEN = 0.2  # share of the acceleration that no one law leaves in a sound recording, [1]
-HOLDS = 0.1  # and what one law leaves where it holds, [1]
+HOLDS = 0.05  # and what one law leaves where it holds, [1]
 RESTORED = 0.25  # the fault is found if without it this share of that is left, [1]
 MISALIGNED = 0.5  # the same for a topic that ends before the others, [1]
 CHANGED = 0.5  # the law of a part leaves less than this share of what that of all leaves, [1]

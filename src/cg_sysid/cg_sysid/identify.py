@@ -21,7 +21,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
-from cg_sysid.simulation_error import Point, Problem, evaluate, own_values, reduced
+from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, own_values, reduced
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
 from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknowns_of
@@ -32,6 +32,7 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CORRECTIONS = 4  # attempts to bring a step back to consistent lumps
 KEPT_SLACK = 0.1  # share of its distance from the border to which such a step is brought back
+CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
 
@@ -207,6 +208,10 @@ def _minimise(
     if point is None:
         return theta, motions, None, False
     damping = 1e-3
+    # The border's weight follows what is still to be gained (a central path): whoever meets the
+    # border early creeps along it ever after.
+    barrier = max(BARRIER, CENTRAL * min(_promised(point), point.cost))
+    point = point.beside(BARRIER, barrier)
     for _ in range(iterations):
         _, gradient, _ = reduced(point, 0.0)
         frozen = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
@@ -219,19 +224,31 @@ def _minimise(
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
         trial_motions = [m + d for m, d in zip(motions, moves, strict=True)]
         candidate = evaluate(problem, trial_theta, trial_motions, horizon, weight)
+        if candidate is not None:
+            candidate = candidate.beside(BARRIER, barrier)
         if candidate is not None and candidate.cost < point.cost:
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
             damping = max(damping / 10, 1e-9)
-            if gain < max(drift * candidate.cost, SMALL_GAIN):
-                return theta, motions, point, True
+            small = max(drift * candidate.cost, SMALL_GAIN)
+            if gain < small and barrier <= max(BARRIER, CENTRAL * small):
+                return theta, motions, point.beside(barrier, BARRIER), True
+            lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
+            point, barrier = point.beside(barrier, lower_barrier), lower_barrier
         else:
             if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:
-                return theta, motions, point, True
+                return theta, motions, point.beside(barrier, BARRIER), True
             damping *= 10
             if damping > 1e8:
-                return theta, motions, point, True
-    return theta, motions, point, False
+                # No step is short enough: a minimum, or a corner of what bodies can be.
+                return theta, motions, point.beside(barrier, BARRIER), candidate is not None
+    return theta, motions, point.beside(barrier, BARRIER), False
+
+
+def _promised(point: Point) -> float:
+    """What a full step would lower the cost by, were it quadratic."""
+    h, g, _ = reduced(point, 0.0)
+    return float(g @ np.linalg.lstsq(h, g, rcond=1e-12)[0]) if len(g) else 0.0
 
 
 def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray, list]:

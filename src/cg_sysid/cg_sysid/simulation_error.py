@@ -6,7 +6,7 @@ Schur complement leaves a system as small as the number of parameters, however m
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -107,9 +107,18 @@ def _consistency(model: Model, names: tuple[str, ...]):
     return evaluate
 
 
-@dataclass
+@dataclass(frozen=True)
+class Border:
+    """What keeps bodies possible, for a barrier of weight one: cost, gradient, curvature."""
+
+    cost: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+
+@dataclass(frozen=True)
 class Point:
-    """Cost and normal equations at one point; None where the simulation runs away."""
+    """Cost and normal equations at one point, the border of consistency with weight BARRIER."""
 
     cost: float
     shared_hessian: np.ndarray
@@ -118,6 +127,17 @@ class Point:
     sse: np.ndarray
     count: np.ndarray
     data_cost: float
+    border: Border
+
+    def beside(self, before: float, barrier: float) -> 'Point':
+        """The same with another weight of the border."""
+        more = barrier - before
+        return replace(
+            self,
+            cost=self.cost + more * self.border.cost,
+            shared_gradient=self.shared_gradient + more * self.border.gradient,
+            shared_hessian=self.shared_hessian + more * self.border.hessian,
+        )
 
 
 def evaluate(
@@ -129,6 +149,7 @@ def evaluate(
     chain = problem.chain(values)
     shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
     own, cost = [], 0.0
+    border = Border(0.0, shared_g, shared_h)
     ny = len(problem.trials[0].sigma)
     sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
     if problem.consistency is not None:
@@ -136,9 +157,7 @@ def evaluate(
         if not (c > 0).all():
             return None
         jacobian = jacobian * chain / c[:, None]
-        cost -= 2 * BARRIER * np.log(c).sum()
-        shared_g -= BARRIER * jacobian.sum(axis=0)
-        shared_h += BARRIER * jacobian.T @ jacobian
+        border = Border(-2 * np.log(c).sum(), -jacobian.sum(axis=0), jacobian.T @ jacobian)
     problem.evaluations += 1
     for i in range(len(problem.trials)):
         n, normal, _, _ = simulate_sensitive(problem, i, values, motions[i], horizon)
@@ -165,7 +184,8 @@ def evaluate(
             cost += away**2
             shared_g[j] += away / u.tolerance
             shared_h[j, j] += 1 / u.tolerance**2
-    return Point(cost, shared_h, shared_g, own, sse, count, data_cost)
+    point = Point(cost, shared_h, shared_g, own, sse, count, data_cost, border)
+    return point.beside(0.0, BARRIER)
 
 
 def simulate_sensitive(

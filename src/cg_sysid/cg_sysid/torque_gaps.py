@@ -12,6 +12,7 @@ import numpy as np
 from cg_sysid.record import NS_PER_S
 
 ON_GRID = 0.35  # a gap is a whole number of spacings to within this many of them
+STEADY = 0.15  # the spacings beside it too, or the loop that stamps was only slow there
 # Impulse that may be unknown in a gap, as that of the RMS torque over this time, in s: a hundredth
 # of a quarter of a second, in which a leg's motion answers a torque.
 KNOWN_S = 0.0025
@@ -64,10 +65,12 @@ def torque_gaps(stamp_ns: np.ndarray, values: np.ndarray) -> list[TorqueGap]:
     rms = float(np.sqrt(np.mean(values**2)))
     whole = np.abs(spacing - 1.0) < ON_GRID
     noise = _fill_error(values, whole, 1)
+    off = np.abs(spacing - np.rint(spacing))
     gaps, errors = [], {1: noise}
     for k in np.flatnonzero(spacing > 1.0 + ON_GRID):
         lost = round(spacing[k]) - 1
-        if lost < 1 or abs(spacing[k] - lost - 1) > ON_GRID:
+        beside = [*off[max(0, k - 1) : k], *off[k + 1 : k + 2]]
+        if lost < 1 or off[k] > ON_GRID or max(beside, default=0.0) > STEADY:
             continue
         if lost not in errors:
             errors[lost] = _fill_error(values, whole, lost)
