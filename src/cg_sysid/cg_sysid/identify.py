@@ -30,8 +30,6 @@ HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
-CORRECTIONS = 4  # attempts to bring a step back to consistent lumps
-KEPT_SLACK = 0.1  # share of its distance from the border to which such a step is brought back
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
@@ -218,8 +216,7 @@ def _minimise(
         if leading:
             frozen |= _unseen(problem, theta, point, weight)
         step, factors = _step(point, damping, frozen)
-        to = _kept_consistent(problem, theta, np.clip(theta + step, lower, upper))
-        trial_theta = np.clip(to, lower, upper)
+        trial_theta = np.clip(theta + step, lower, upper)
         step = trial_theta - theta
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
         trial_motions = [m + d for m, d in zip(motions, moves, strict=True)]
@@ -260,28 +257,6 @@ def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray,
         scaled = h[np.ix_(free, free)] / np.outer(scale, scale)
         step[free] = -np.linalg.lstsq(scaled, g[free] / scale, rcond=1e-12)[0] / scale
     return step, factors
-
-
-def _kept_consistent(problem: Problem, theta: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """A step's end, moved back inside what bodies can be where it leaves that.
-
-    Steps are straight and the border is not: along it, only ever shorter steps would be allowed
-    (the Maratos effect). A second-order correction across the border lets them be long.
-    """
-    if problem.consistency is None:
-        return to
-    inside, _ = problem.consistency(problem.values(theta))
-    scales = np.array([u.scale for u in problem.unknowns]) / problem.chain(problem.values(theta))
-    for _ in range(CORRECTIONS):
-        values = problem.values(to)
-        slack, jacobian = problem.consistency(values)
-        short = slack <= 0
-        if not short.any():
-            break
-        across = (jacobian * problem.chain(values))[short] * scales
-        missing = KEPT_SLACK * inside[short] - slack[short]
-        to = to + scales * np.linalg.lstsq(across, missing, rcond=None)[0]
-    return to
 
 
 def _unseen(

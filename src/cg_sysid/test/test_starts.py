@@ -66,8 +66,8 @@ def test_every_record_has_its_own_push(model_file):
     # As a diagnosis does with those in reach: seek again with better parameters.
     again = replace(outcome.task, so_far=outcome.train)
     outcome = try_candidate(again, trials[::2], trials[1::2])
-    # Noise alone gives 1; two short records leave the other numbers uncertain.
-    assert outcome.held.normalised_error < 1.5
+    # Noise alone gives 1, within a few percent at a thousand rows.
+    assert outcome.held.normalised_error < 1.2
     for k in range(4):
         impulse, instant = outcome.events[f'record_{k}']
         if k in pushes:
