@@ -18,7 +18,7 @@ from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
-FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
+ITERATIONS = 60
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 MOST_STARTS = 24
 FOLLOWED = 3  # starts of a swept parameter that are worth a second look
@@ -40,7 +40,8 @@ class Task:
         events: What happened in each trial alone, as far as the base knows it: name of the trial
             -> own values (unknowns.own_unknowns).
         bounds: Small faults that the base may have (imperfections.py).
-        so_far: Go on from this fit, for as long as it takes; without one a first, short fit.
+        so_far: Go on from this fit; without one from the effect's own starts.
+        iterations: Limit for whole records.
     """
 
     model: Model
@@ -48,6 +49,22 @@ class Task:
     events: Mapping[str, np.ndarray] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
     so_far: Fit | None = None
+    iterations: int = ITERATIONS
+
+
+@dataclass(frozen=True)
+class Look:
+    """A fit to the first seconds of each record: is a candidate worth a whole one?
+
+    Attributes:
+        label: Label of the effect.
+        task: What to go on with.
+        error: chi2/N of these seconds; NaN where they cannot tell.
+    """
+
+    label: str
+    task: Task
+    error: float
 
 
 @dataclass(frozen=True)
@@ -108,16 +125,38 @@ def starts_of(name: str) -> list[dict[str, float]]:
     return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
 
 
+def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
+    """Fit one candidate to the first seconds of the training trials, from each of its starts.
+
+    Returns:
+        The look, or a sentence saying why there is none.
+    """
+    label, task = _label(task), _unbound(task)
+    longest = max(trial.duration for trial in train)
+    late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
+    if _eventful(task) or late or longest < 2 * SCREEN_S:
+        return Look(label, task, np.nan)
+    try:
+        found = _first_seconds(task, train)
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+    return Look(label, replace(task, so_far=found), found.normalised_error)
+
+
+def _unbound(task: Task) -> Task:
+    """A small fault that is tried as a cause is no longer bound to be small."""
+    label = _label(task)
+    bounds = {n: b for n, b in task.bounds.items() if not n.startswith(f'{label}.')}
+    return replace(task, bounds=bounds)
+
+
 def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
     """Fit one candidate on the training trials and score it on the held-out ones.
 
     Returns:
         The outcome, or a sentence saying why there is none.
     """
-    label = _label(task)
-    # A small fault that is tried as a cause is no longer bound to be small.
-    bounds = {n: b for n, b in task.bounds.items() if not n.startswith(f'{label}.')}
-    task = replace(task, bounds=bounds)
+    label, task = _label(task), _unbound(task)
     try:
         best = _best_fit(task, train)
         events = _events_of(best, train)
@@ -143,7 +182,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     return Outcome(
         task, label, model, best, held_score, residuals, belief,
         # Small faults cost nothing: every robot has them.
-        len(best.unknowns) - len(bounds) + len(best.own) * (len(train) + len(held)), events,
+        len(best.unknowns) - len(task.bounds) + len(best.own) * (len(train) + len(held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),
     )  # fmt: skip
 
@@ -177,22 +216,32 @@ def cost_of(effect: tuple[str, str | None]) -> int:
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    if own_unknowns(task.model) == () != own_unknowns(next(_starting_models(task))):
+    if _eventful(task):
         return _event_fit(task, train)
-    if task.so_far is not None:
-        model = next(_starting_models(task))
-        return fit(model, train, start=task.so_far, bounds=task.bounds)
-    # A short horizon tells which start is worth going on from, on the way to the full one.
     models = list(_starting_models(task))
-    if len(models) == 1:
-        return fit(models[0], train, own=task.events, bounds=task.bounds)
+    start = task.so_far
+    if start is None and len(models) > 1:
+        start = _first_seconds(task, train)
+    return fit(
+        models[0], train, start=start, own=task.events, bounds=task.bounds,
+        iterations=task.iterations,
+    )  # fmt: skip
+
+
+def _eventful(task: Task) -> bool:
+    """Whether the effect is one of which every record has its own."""
+    return own_unknowns(task.model) != own_unknowns(next(_starting_models(task)))
+
+
+def _first_seconds(task: Task, train: Sequence[Trial]) -> Fit:
+    """The best of the fits to the first seconds, from every start."""
+    models = list(_starting_models(task))
     kept = _swept(models[0])
     looks = _looks(task, models, train, kept)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
         looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
-    look, _ = looks[0]
-    return fit(models[0], train, start=look, bounds=task.bounds, iterations=FIRST_ITERATIONS)
+    return looks[0][0]
 
 
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
@@ -206,7 +255,7 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
         model = next(_starting_models(task))
         events = seek_events(model.with_values(at), train)
         settled = fit(
-            model, train, at=at, own=events, bounds=task.bounds, iterations=FIRST_ITERATIONS
+            model, train, at=at, own=events, bounds=task.bounds, iterations=task.iterations
         )
         if best is None or settled.normalised_error < best.normalised_error:
             best = settled

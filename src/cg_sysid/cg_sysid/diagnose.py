@@ -21,12 +21,15 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
+    ITERATIONS,
+    Look,
     Outcome,
     Task,
     candidates_for,
     chi2,
     cost_of,
     events_of,
+    look_at,
     parameters_of,
     strained,
     try_candidate,
@@ -58,7 +61,9 @@ REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
-IN_REACH = 10.0  # times the smallest error, from which a fit that has not converged may win
+FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
+IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
+FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
 Progress = Callable[[str, int, int], None]
 
 
@@ -277,8 +282,8 @@ class _Search:
         ranked = contest.of(label)
         if ranked is None or chi2(final) < chi2(ranked[1]):
             outcomes = [o for _, o in contest.ranked if o.label != label]
-            contest = self.jury.contest(contest.base, [*outcomes, replace(final, label=label)])
-            self.contests[key] = contest
+            again = self.jury.contest(contest.base, [*outcomes, replace(final, label=label)])
+            contest = self.contests[key] = replace(again, aside=contest.aside)
         return contest
 
     def _contest(self, base: Outcome) -> Contest:
@@ -294,22 +299,37 @@ class _Search:
             # The longest first, or the last of them would be waited for.
             effects.sort(key=cost_of, reverse=True)
             tasks = [Task(base.model, effect, base.events, bounds) for effect in effects]
-            outcomes = self._fit_all(tasks, f'effects on top of {self._title(added)}')
-            self.contests[key] = self.jury.contest(base, outcomes)
+            outcomes, aside = self._fit_all(tasks, f'effects on top of {self._title(added)}')
+            contest = self.jury.contest(base, outcomes)
+            self.contests[key] = replace(contest, aside=tuple(aside))
         return self.contests[key]
 
-    def _fit_all(self, tasks: list[Task], what: str) -> list[Outcome]:
-        """Fit candidates, and go on with those that have not converged and may still win."""
-        first = self._fitted(tasks, what)
+    def _fit_all(self, tasks: list[Task], what: str) -> tuple[list[Outcome], list[str]]:
+        """Fit candidates, ever longer those that may still win.
+
+        Returns:
+            Outcomes of fits to whole records, and labels of those that a first look set aside.
+        """
+        looks = self._looked_at(tasks, f'first look at {what}')
+        worth = _worth_more(looks)
+        first = self._fitted([replace(t, iterations=FIRST_ITERATIONS) for t in worth], what)
         best = min((chi2(o) for o in first.values()), default=0.0)
         again = [
-            replace(o.task, so_far=o.train)
+            replace(o.task, so_far=o.train, iterations=ITERATIONS)
             for o in first.values()
             if not o.train.converged and chi2(o) < IN_REACH * best
         ]
         second = self._fitted(again, f'{what}, in more depth') if again else {}
         better = {n: o for n, o in second.items() if chi2(o) < chi2(first[n])}
-        return list({**first, **better}.values())
+        aside = [look.label for look in looks if not any(look.task is task for task in worth)]
+        return list({**first, **better}.values()), aside
+
+    def _looked_at(self, tasks: list[Task], what: str) -> list[Look]:
+        looks = self._run(look_at, [(task, self.train) for task in tasks], what)
+        for task, look in zip(tasks, looks, strict=True):
+            if isinstance(look, str):
+                log.info('%s: %s', task.effect, look)
+        return [look for look in looks if isinstance(look, Look)]
 
     def _fitted(self, tasks: list[Task], what: str) -> dict[str, Outcome]:
         found = {}
@@ -335,7 +355,9 @@ class _Search:
     def _note(self, contest: Contest, accepted: str) -> None:
         candidates = tuple(c for c, _ in contest.ranked)
         title = self._title(self._added(contest.base))
-        self.rounds.append(Round(title, candidates, accepted, contest.independent))
+        self.rounds.append(
+            Round(title, candidates, accepted, contest.independent, contest.aside)
+        )
 
     def _causes(self, nominal: Outcome, final: Outcome) -> list[Cause]:
         causes = []
@@ -407,6 +429,15 @@ class _Search:
             findings=(*_small_faults(final), *final.train.warnings),
             unmodelled=unmodelled,
         )  # fmt: skip
+
+
+def _worth_more(looks: Sequence[Look]) -> list[Task]:
+    """Tasks whose first look is within reach of the best, the longest to fit first."""
+    errors = sorted(look.error for look in looks if np.isfinite(look.error))
+    limit = IN_REACH * errors[0] if errors else np.inf
+    limit = max(limit, errors[min(FEWEST, len(errors)) - 1]) if errors else limit
+    worth = [look.task for look in looks if not look.error > limit]
+    return sorted(worth, key=lambda task: cost_of(task.effect), reverse=True)
 
 
 def _shows(o: Outcome, label: str) -> bool:

@@ -72,12 +72,21 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Round:
-    """All candidates tried on top of one base model, best first, and what was made of them."""
+    """All candidates tried on top of one base model, best first, and what was made of them.
+
+    Attributes:
+        base: Title of that model.
+        candidates: Those fitted to whole records, judged.
+        accepted: Label of the one that was taken up; empty if none.
+        independent: Independent samples behind the evidence.
+        aside: Labels of those that the first seconds of the records ruled out.
+    """
 
     base: str
     candidates: tuple[Candidate, ...]
     accepted: str
     independent: float
+    aside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -324,6 +324,7 @@ def _round(r: Round) -> Facts:
         'accepted': r.accepted or None,
         'independent_samples': r.independent,
         'candidates': [_candidate(c) for c in r.candidates],
+        'set_aside': list(r.aside),
     }
 
 

@@ -45,12 +45,14 @@ class Contest:
         ranked: Each candidate and the outcome of its fit.
         independent: Independent samples behind the evidence.
         margin: Evidence in nats by which rivals are not told apart.
+        aside: Labels of those that a first look set aside.
     """
 
     base: Outcome
     ranked: tuple[tuple[Candidate, Outcome], ...]
     independent: float
     margin: float
+    aside: tuple[str, ...] = ()
 
     def winner(self) -> tuple[Candidate, Outcome] | None:
         """The best candidate that is earned, or a simpler one that it contains."""

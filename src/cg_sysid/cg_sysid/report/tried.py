@@ -19,7 +19,7 @@ def rounds(facts: Facts) -> Markup | None:
     return tag('section',
         tag('h2', 'What was tried'),
         tag('p', 'Every effect of the library was fitted on top of the model, from several '
-            'starts. Evidence counts how strongly all records speak for it, after paying for its '
+            'starts, to the first seconds and, where promising, to whole records. Evidence counts how strongly all records speak for it, after paying for its '
             'parameters; the error is judged on records held out.', class_='soft'),
         [_round(k, r, causes) for k, r in enumerate(facts['ranking'], start=1)],
         id='tried',
@@ -43,6 +43,9 @@ def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
             tag('details', tag('summary', f'{len(rest)} more candidates'),
                 tag('div', _ranking(rest, taken, rivals, strongest), class_='scroll'))
             if rest else None,
+            tag('p', 'Ruled out by the first seconds of the records: ',
+                ', '.join(effect_name(label) for label in r['set_aside']), class_='small')
+            if r['set_aside'] else None,
             open=k == 1),
         class_='round',
     )  # fmt: skip
