@@ -149,7 +149,7 @@ def judge(raw, name, where, at, model):
     report = check_recording(raw, model)
     places = {where, TOPIC_OF.get(where, where)}
     named = [f for f in report.of(name) if where == spoil.ALL or f.where in places]
-    if where in ('hip_torque', 'hip_angle'):  # one of a pair, where only they are against each other
+    if where in ('hip_torque', 'hip_angle'):  # either, where only these two disagree
         named = named or [f for f in report.of(name) if f.where in ('hip_torque', 'hip_angle')]
     placed = [f for f in named if f.start_s is None or abs(f.start_s - at) < 0.25]
     unusable = report.verdict == 'unusable'
@@ -179,7 +179,10 @@ def fault_table(seeds, quick) -> Iterator[str]:
         yield ''
         yield '## Faults' + ('' if arrivals else ', where times of arrival equal the stamps')
         yield ''
-        yield '| fault | where and how much | cases | named | in place | unusable | repaired | missed |'
+        yield (
+            '| fault | where and how much | cases | named | in place | unusable | repaired '
+            '| missed |'
+        )
         yield '|---|---|---:|---:|---:|---:|---:|---:|'
         for (name, what), found in rows.items():
             shares = np.mean(found, axis=0)
