@@ -3,8 +3,8 @@
 What the nominal model leaves of the measured motion (measured_motion.py) is regressed sparsely on
 what each effect of our library would add along that motion. Shapes and frequencies enter
 as one column for each of their starts, phases as a sine and a cosine; effects with states of their
-own are simulated along the motion. pysindy's FROLS chooses the terms; its STLSQ, the best of a path
-of thresholds, chose the same ones on the seeds on which all was tuned.
+own are simulated along the motion. pysindy's FROLS chooses the terms; its STLSQ, the best of a
+path of thresholds, chose the same ones on the seeds on which all was tuned.
 
 The parameters of rigid body and friction are either identified beforehand and again in the same
 regression, free of the sparsity, with the file's tolerances as a ridge; or they are told. The

@@ -207,12 +207,13 @@ def _surest(found: Fit) -> list[np.ndarray]:
     return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
 
 
-def cost_of(effect: tuple[str, str | None]) -> int:
+def cost_of(task: Task) -> int:
     """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
-    kind = LIBRARY[effect[0]]
+    name = _label(task).partition('@')[0]
+    kind = LIBRARY[name]
     events = any(p.each for p in kind.parameters)
     swept = any(p.swept for p in kind.parameters)
-    return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(effect[0]))
+    return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(name))
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:

@@ -22,7 +22,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cg_description
 import cg_dynamics
@@ -154,7 +154,8 @@ class Cluster(Executor):
                 f'{self.address} --nthreads 1'
             )
         # Versions come without unpickling anything, which other versions might not be able to.
-        for worker, found in self._client.get_versions()['workers'].items():
+        versions = cast(dict[str, Any], self._client.get_versions())
+        for worker, found in versions['workers'].items():
             python = found['host']['python'].partition('.final')[0]
             self._same_software(worker, {'python': python})
         for worker, found in self._client.run(software_here, on_error='return').items():

@@ -296,9 +296,9 @@ class _Search:
                 base.model, self._setups(), self.options.effects, recorded,
                 imperfect(base.model, bounds),
             )  # fmt: skip
-            # The longest first, or the last of them would be waited for.
-            effects.sort(key=cost_of, reverse=True)
             tasks = [Task(base.model, effect, base.events, bounds) for effect in effects]
+            # The longest first, or the last of them would be waited for.
+            tasks.sort(key=cost_of, reverse=True)
             outcomes, aside = self._fit_all(tasks, f'effects on top of {self._title(added)}')
             contest = self.jury.contest(base, outcomes)
             self.contests[key] = replace(contest, aside=tuple(aside))
@@ -437,7 +437,7 @@ def _worth_more(looks: Sequence[Look]) -> list[Task]:
     limit = IN_REACH * errors[0] if errors else np.inf
     limit = max(limit, errors[min(FEWEST, len(errors)) - 1]) if errors else limit
     worth = [look.task for look in looks if not look.error > limit]
-    return sorted(worth, key=lambda task: cost_of(task.effect), reverse=True)
+    return sorted(worth, key=cost_of, reverse=True)
 
 
 def _shows(o: Outcome, label: str) -> bool:

@@ -116,7 +116,7 @@ def test_a_wrong_sign_is_found(sound, set_up, channel):
 @pytest.mark.parametrize('set_up', ['spring_stabilised_inner', 'spring_stabilised_outer'])
 def test_an_imu_mounted_the_wrong_way_round_is_found_by_the_model(sound, set_up):
     spoilt = spoil.mirrored(('imu_angle', 'imu_rate'))(sound[set_up])
-    report, found = findings(spoilt, 'sign_error')
+    _, found = findings(spoilt, 'sign_error')
     assert {f.where for f in found} == {'imu_angle', 'imu_rate'}
     assert check_recording(spoilt).verdict != 'unusable'  # without a model nobody can tell
 

@@ -11,17 +11,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cg_description.model_file import Quantity
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import TIME, Effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnose_cli import LEARNED, write_results
 from cg_sysid.diagnosis import Options
-from cg_sysid.diagnosis_file import diagnosis_facts
 from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.identify import score
 from cg_sysid.rehearse import rehearse
 
 SAMPLE = 0.004

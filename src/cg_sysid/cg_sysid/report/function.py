@@ -48,8 +48,8 @@ def _gain(term: Facts) -> Markup | None:
     gain = term['gain'][channel]
     factor, unit = scaled(gain['before'], gain['unit'])
     before, after = (number(factor * gain[key]) for key in ('before', 'after'))
-    return tag('p', f'With it the error of {channel} on held-out recordings falls from {before} to '
-               f'{after} {unit}.', class_='soft small')  # fmt: skip
+    return tag('p', f'With it the error of {channel} on held-out recordings falls from '
+               f'{before} to {after} {unit}.', class_='soft small')  # fmt: skip
 
 
 def _above_noise(gain: Facts) -> float:

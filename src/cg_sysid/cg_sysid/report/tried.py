@@ -19,8 +19,9 @@ def rounds(facts: Facts) -> Markup | None:
     return tag('section',
         tag('h2', 'What was tried'),
         tag('p', 'Every effect of the library was fitted on top of the model, from several '
-            'starts, to the first seconds and, where promising, to whole records. Evidence counts how strongly all records speak for it, after paying for its '
-            'parameters; the error is judged on records held out.', class_='soft'),
+            'starts, to the first seconds and, where promising, to whole records. Evidence '
+            'counts how strongly all records speak for it, after paying for its parameters; '
+            'the error is judged on records held out.', class_='soft'),
         [_round(k, r, causes) for k, r in enumerate(facts['ranking'], start=1)],
         id='tried',
     )  # fmt: skip
