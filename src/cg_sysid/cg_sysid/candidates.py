@@ -98,16 +98,17 @@ def candidates_for(
     """
     known = {*model.mechanism.inputs, TIME, *recorded}
     present = {effect.label for effect in model.effects}.difference(small)
-    found = []
+    found, asked = [], False
     for name, effect in LIBRARY.items():
         if not effect.applies(setups) or not known.issuperset(effect.extra_inputs):
             continue
         for at in effect.sites(model.mechanism):
             made = effect(model.mechanism, at)
             wanted = names is None or name in names or made.label in names
+            asked |= wanted
             if wanted and made.label not in present:
                 found.append((name, made.at))
-    if names is not None and not found:
+    if names is not None and not asked:
         raise IdentificationError(
             f'none of the effects {", ".join(names)} can be tried; the library has: '
             f'{", ".join(LIBRARY)}'
