@@ -35,6 +35,7 @@ WINDOW = 2.5  # pieces
 LEARNING_S = 40.0  # windows to learn from, all together; what is beyond adds little
 LONGEST_WINDOW = 1.25  # s
 STOOD_IN = 0.5  # share of the error that causes or a term must take from what is without them
+OF_USE = 0.3  # share of the fall of the log error that causes must have beside a term
 NEGLIGIBLE = 0.05  # chi2 per sample above the noise; less is not compared
 WORSE = 3.0  # times the error on windows that a fit of whole records may leave
 OUT_OF_RANGE = 0.15  # share of the range of its variable by which a function may miss it
@@ -108,7 +109,11 @@ def _causes_stand(
     with_causes, with_term, with_both = (
         max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits
     )
-    return with_term > STOOD_IN * with_causes or with_both < STOOD_IN * with_term
+    if with_term > STOOD_IN * with_causes:
+        return True
+    # A little that a cause adds to a term is what the term is too smooth for.
+    added, altogether = np.log(with_term / with_both), np.log(with_causes / with_both)
+    return bool(added > max(OF_USE * altogether, np.log(1 / STOOD_IN)))
 
 
 def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[float, list[Term]]:

@@ -168,8 +168,10 @@ class Case:
 
 
 CASES = (
+    # Four harmonics of this detent leave 7 % of it (the fifth is b_n = n I_n(3)).
     Case(DetentTorque, ('cogging_torque', 'position_dependent_friction'),
-         'unmodelled_joint_torque_periodic_in_angle', 'joint', 'angle:hip', 'odd', PITCH),
+         'unmodelled_joint_torque_periodic_in_angle', 'joint', 'angle:hip', 'odd', PITCH,
+         error=0.14),
     Case(DeadZone, ('torque_constant', 'torque_saturation', 'load_dependent_friction'),
          'unmodelled_joint_torque_of_torque', 'torque path', 'torque:hip', 'odd'),
     Case(SoftStop, ('ground_slope', 'payload'),
