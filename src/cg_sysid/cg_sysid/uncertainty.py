@@ -64,7 +64,8 @@ def _own_sigmas(
 
 def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of the curvature, and which unknowns it leaves undetermined."""
-    scale = np.sqrt(np.maximum(np.diag(h), 1e-300))
+    diagonal = np.diag(h)
+    scale = np.sqrt(np.where(diagonal > 1e-200 * diagonal.max(), diagonal, 1.0))
     eigenvalues, vectors = np.linalg.eigh(h / np.outer(scale, scale))
     # A direction that neither data nor belief determine has infinite variance, not a crash.
     kept = eigenvalues > 1e-13 * eigenvalues.max()
