@@ -14,28 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from cg_dynamics.linearise import Linearisation, linearise
+from cg_dynamics.linearise import Linearisation, linearise, without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
-# Friction whose slope at standstill is an artefact of smoothing.
-DRY_FRICTION = (
-    'coulomb_friction', 'stribeck_friction', 'presliding_friction', 'load_dependent_friction',
-    'position_dependent_friction', 'asymmetric_friction', 'friction_drift', 'ankle_friction',
-)  # fmt: skip
 # They change what is commanded, read or met on the way, not how the bodies move.
 NOT_DESIGNED_ON = ('command', 'transmission', 'sensor', 'timing')
 
 
 def design_model(model: Model) -> Model:
     """The model without extra states, delays, sensor errors and dry friction."""
+    model = without_dry_friction(model)
     for effect in model.effects:
-        if (
-            effect.states
-            or effect.extra_inputs
-            or effect.name in DRY_FRICTION
-            or effect.place in NOT_DESIGNED_ON
-        ):
+        if effect.states or effect.extra_inputs or effect.place in NOT_DESIGNED_ON:
             model = model.without_effect(effect.label)
     return model
 
