@@ -1,10 +1,11 @@
-"""The rival without a model: filter the angles, take differences.
+"""The rival without a model: filter the readings, take differences.
 
-    v[k] = (q[k] - q[k-1]) / T                                                        (DIFF)
+    v[k] = (y[k] - y[k-1]) / T                                                        (DIFF)
 
-where q are the measured angles of both legs, as they are or low-passed: by a first-order filter,
-whose pole exp(-2 pi f T) is exact for any interval, or by a Chebyshev filter of the first kind and
-fifth order. The latter knows one rate only, so gaps are filled by straight lines.
+where y are the lean and the hip angle, as they are or low-passed: by a first-order filter, whose
+pole exp(-2 pi f T) is exact for any interval, or by a Chebyshev filter of the first kind and fifth
+order. The latter knows one rate only, so gaps are filled by straight lines. With the gyro only the
+hip angle is differentiated, as on a robot whose IMU tells the rate of one leg.
 """
 
 import math
@@ -76,7 +77,7 @@ class Derivative(StampedEstimator):
         model: Only names the channels.
         setup: The set-up.
         sample_time: Nominal time between measurements in s.
-        kind: Filter of the angles: 'none', 'first_order' or 'chebyshev'.
+        kind: Filter of the readings: 'none', 'first_order' or 'chebyshev'.
         cutoff_hz: Its cutoff: -3 dB of the first-order one, end of the ripple of the Chebyshev.
         use_gyro: Whether the rate of the inner legs is that of the IMU, filtered alike.
         longest_gap: Gap in s after which the estimate starts anew.
@@ -105,7 +106,9 @@ class Derivative(StampedEstimator):
 
     def _begin(self, motion: np.ndarray, torque: float) -> None:
         self._x = motion
-        self._raw = np.array([motion[0], motion[1], motion[2]])
+        reading = {'imu_angle': motion[0], 'hip_angle': motion[0] - motion[1]}
+        self._raw = np.array([reading.get(c, motion[2]) for c in self.channels])
+        self._smooth = self._raw
         self._filter: FirstOrder | Chebyshev | None = None
         if self.kind == 'first_order':
             self._filter = FirstOrder(self.cutoff_hz, self._raw)
@@ -116,18 +119,14 @@ class Derivative(StampedEstimator):
         """There is no model."""
 
     def _correct(self, y: np.ndarray, duration: float) -> None:
-        reading = dict(zip(self.channels, y, strict=True))
-        lean, hip, gyro = (reading[c] for c in ('imu_angle', 'hip_angle', 'imu_rate'))
-        lean = self._raw[0] if math.isnan(lean) else lean
-        outer = self._raw[1] if math.isnan(hip) else lean - hip
-        self._raw = np.array([lean, outer, self._raw[2] if math.isnan(gyro) else gyro])
-        smooth = self._raw
-        if self._filter is not None:
-            smooth = self._filter.step(self._raw, duration)
-        rates = (smooth[:2] - self._x[:2]) / duration
-        if self.use_gyro:
-            rates[0] = smooth[2]
-        self._x = np.array([*smooth[:2], *rates])
+        last = self._raw
+        raw = np.where(np.isnan(y), last, y)
+        smooth = raw if self._filter is None else self._filter.step(raw, duration)
+        slopes = (smooth - self._smooth) / duration
+        self._raw, self._smooth = raw, smooth
+        lean, rate, hip = (self.channels.index(c) for c in ('imu_angle', 'imu_rate', 'hip_angle'))
+        inner = smooth[rate] if self.use_gyro else slopes[lean]
+        self._x = np.array([smooth[lean], smooth[lean] - smooth[hip], inner, inner - slopes[hip]])
 
     def _land(self, stance: str) -> None:
         # The angles do not jump, and the differences see the new rates by themselves.
