@@ -5,7 +5,7 @@
 once per sample, as docs/interfaces.md ("Lock-step") says of the nodes. Benches and tests run this.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +62,7 @@ def balance(
     estimator: Estimator,
     controller: BalanceController,
     duration: float,
-    disturb: Callable[[float], float] | None = None,
+    pushes: Sequence[tuple[float, float]] = (),
 ) -> BalanceRun:
     """Run the loop until time is over or the robot lies.
 
@@ -71,14 +71,17 @@ def balance(
         estimator: Told the readings and the torque that was latched.
         controller: Told the estimate.
         duration: In s.
-        disturb: Time in s -> torque in N m that is added behind the gate, unknown to all.
+        pushes: Instants in s and horizontal impulses in N s at the hip.
     """
     stance = plant.setup.stance
     standing = STANCES.index(stance)
     gate = TorqueGate(GateSettings(torque_limit=controller.torque_limit), ('hip',))
     rows: list[tuple] = []
     torque = 0.0
-    for _ in range(round(duration * 1e9 / plant.sample_ns)):
+    hits = {round(instant * 1e9 / plant.sample_ns): impulse for instant, impulse in pushes}
+    for tick in range(round(duration * 1e9 / plant.sample_ns)):
+        if tick in hits:
+            plant.push(hits[tick])
         measurement = plant.measure()
         now = measurement.time_ns
         estimate = estimator.step(now, torque, measurement.outputs, stance)
@@ -88,7 +91,7 @@ def balance(
         rows.append(
             (now * 1e-9, plant.state, estimate.x, torque, measurement.outputs, controller.mode)
         )
-        plant.latch([torque + (disturb(now * 1e-9) if disturb else 0.0)])
+        plant.latch([torque])
         try:
             plant.advance()
         except SimulationError:
