@@ -91,7 +91,7 @@ def balance(
         rows.append(
             (now * 1e-9, plant.state, estimate.x, torque, measurement.outputs, controller.mode)
         )
-        plant.latch([torque])
+        plant.latch(np.array([torque]))
         try:
             plant.advance()
         except SimulationError:

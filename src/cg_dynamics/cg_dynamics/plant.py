@@ -152,8 +152,8 @@ class Plant:
             jump = ca.solve(e.mass_matrix, jacobian.T)
             self._jolt = ca.Function('jolt', [e.x, e.p], [jump])
         m = self._compiled.equations.coordinates
-        jump = np.asarray(self._jolt(self._x, self._p)).ravel()
-        self._x[m : 2 * m] += impulse * jump
+        jolt = np.asarray(self._jolt(self._x, self._p)).ravel()
+        self._x[m : 2 * m] += impulse * jolt
         self._past[-1] = (self._past[-1][0], self._x.copy())
 
     def measure(self) -> Measurement:
