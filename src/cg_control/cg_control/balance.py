@@ -229,12 +229,13 @@ class BalanceController:
         # A different law must not make the torque jump: the difference dies out.
         law = (stance, id(self.gains[stance]))
         elapsed = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / NANOSECONDS
-        if law != self._law:
-            self._offset, self._law = self._torque - wanted, law
-        elif self.settings.hand_over > 0.0:
-            self._offset *= math.exp(-max(elapsed, 0.0) / self.settings.hand_over)
-        else:
+        if self.settings.hand_over == 0.0:
             self._offset = 0.0
+        elif law != self._law:
+            self._offset = self._torque - wanted
+        else:
+            self._offset *= math.exp(-max(elapsed, 0.0) / self.settings.hand_over)
+        self._law = law
         torque = self._smoothed(wanted + self._offset, elapsed)
         self._torque, self._last_ns = torque, stamp_ns
         torque += self.friction.torque(x[2] - x[3], self.settings)

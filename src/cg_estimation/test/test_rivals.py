@@ -85,7 +85,7 @@ def test_steady_gain_is_the_limit_of_the_extended_filter():
 
 
 def test_landing_moves_the_covariance_along(recording):
-    stamps, torque, outputs, _ = recording
+    stamps, _, outputs, _ = recording
     kalman = ExtendedKalmanFilter(MODEL)
     for k in range(100):
         kalman.step(int(stamps[k]), 0.0, {c: y[k] for c, y in outputs.items()}, 'inner')
