@@ -147,7 +147,8 @@ def table() -> Iterator[str]:
     yield ''
     yield (
         '| velocities from | stance | balances from 0.02 rad | from how far, rad '
-        '| torque RMS, N m | of that above 8 Hz, N m | lean after 0.5 N s, mrad | largest push, N s |'
+        '| torque RMS, N m | of that above 8 Hz, N m | lean after 0.5 N s, mrad '
+        '| largest push, N s |'
     )
     yield '|---|---|---|---:|---:|---:|---:|---:|'
     for variant in VARIANTS:
