@@ -26,6 +26,7 @@ from cg_estimation.samples import Gatherer
 NOMINAL_MODEL = 'compass_gait_mit'
 LOADED = 0.5  # N, or the 1 of a plain switch
 ROTOR = 'hip_rotor'
+NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
 REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
 
 
@@ -61,10 +62,14 @@ class ObserverNode(Node):
         self._longest = 0.0
         self._next_diagnosis = 0.0
         self._last_ns = 0
+        self._begun = False
+        self._first_heard: float | None = None
         self.publisher = self.create_publisher(JointState, '/state', SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.applied = self.create_subscription(
+            JointState, '/applied_torque', self.on_torque, SENSOR_QOS
+        )
         for kind, topic, heard in (
-            (JointState, '/applied_torque', self.on_torque),
             (JointState, '/hip_encoder', self.on_encoder),
             (WrenchStamped, '/foot_contact/inner', lambda m: self.on_contact('inner', m)),
             (WrenchStamped, '/foot_contact/outer', lambda m: self.on_contact('outer', m)),
@@ -107,7 +112,7 @@ class ObserverNode(Node):
         if stamp_ns < self._last_ns - REPEATED_START:
             self.gatherer.restart()
             self.estimator.reset()
-            self._last_ns = 0
+            self._last_ns, self._begun = 0, False
         if stamp_ns == self._last_ns and 'imu_angle' in outputs:
             self.publisher.publish(self.message)
             return
@@ -115,7 +120,17 @@ class ObserverNode(Node):
         self._use()
 
     def _use(self) -> None:
+        if not self._begun and not self._hears_the_drive():
+            return
         for measurement in self.gatherer.due():
+            if not self._begun and self.declared.values.stance == 'contacts':
+                if measurement.stance is None:
+                    self.get_logger().warning(
+                        'the foot contacts do not tell which leg stands; no state is published',
+                        throttle_duration_sec=1.0,
+                    )
+                    continue
+            self._begun = True
             start = time.perf_counter()
             settings = self.declared.values
             tune(self.estimator, settings)
@@ -125,6 +140,12 @@ class ObserverNode(Node):
             self._publish(estimate, settings.longest_blind)
             self._last_ns = measurement.stamp_ns
             self._longest = max(self._longest, time.perf_counter() - start)
+
+    def _hears_the_drive(self) -> bool:
+        """True if the drive is heard, or there is none: discovery takes its time."""
+        now = time.monotonic()
+        self._first_heard = self._first_heard or now
+        return self.applied.get_publisher_count() > 0 or now > self._first_heard + NO_DRIVE
 
     def _publish(self, estimate: Estimate, longest_blind: float) -> None:
         if not estimate.blind <= longest_blind:

@@ -55,9 +55,31 @@ def test_what_is_late_or_repeated_is_not_given_out_again():
     assert list(gatherer.due()) == []
 
 
+def test_without_foot_contacts_the_stance_leg_must_be_told_otherwise():
+    told = Gatherer(contacts=False)
+    told.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+    assert len(list(told.due())) == 1
+    asking = Gatherer()
+    asking.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+    assert list(asking.due()) == []
+
+
 def test_both_feet_down_do_not_tell_which_one_stands():
     gatherer = Gatherer()
     gatherer.add_contact(T, 'inner', True)
     gatherer.add_contact(T, 'outer', True)
     gatherer.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
     assert [m.stance for m in gatherer.due()] == [None]
+
+
+def test_the_leg_that_lands_stands_from_its_first_touch_on():
+    gatherer = Gatherer()
+    heard = []
+    for k, (inner, outer) in enumerate([(1, 0), (1, 0), (1, 1), (1, 1), (0, 1), (0, 1)], start=1):
+        gatherer.add(k * T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+        gatherer.add_contact(k * T, 'inner', bool(inner))
+        gatherer.add_contact(k * T, 'outer', bool(outer))
+        heard += [m.stance for m in gatherer.due()]
+        gatherer.add_torque(k * T, 0.0)
+    # Both feet down tell nothing new.
+    assert heard == ['inner', 'inner', 'outer', None, 'outer', 'outer']
