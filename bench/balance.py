@@ -1,10 +1,13 @@
 """What each way to a velocity does to the balancing loop: seed 4.3 and 4.4 as one table.
 
-    python bench/balance.py             writes bench/results/balance.md            (2 min)
-    python bench/balance.py --basin     writes bench/results/balance_basin.md      (4 min)
+    python bench/balance.py             writes bench/results/balance_flexible.md   (2 min)
+    python bench/balance.py imu_mount   writes bench/results/balance_imu_mount.md  (2 min)
+    python bench/balance.py --basin     writes bench/results/balance_basin.md      (3 min)
 
-The robot is compass_gait_flexible: harmonic drive resonant at 10.6 Hz, drive 3 ms late, encoder of
-20000 counts, noisy IMU, 500 Hz. Observer and controller know compass_gait_mit, the rigid model.
+The robot is compass_gait_flexible (harmonic drive resonant at 10.6 Hz) or compass_gait_imu_mount
+(bracket of the IMU resonant there); either has a drive 3 ms late, an encoder of 20000 counts, a
+noisy IMU, 500 Hz. Observer and controller know compass_gait_mit, the rigid model, but for the
+rows with the extended model, which is that of the robot.
 """
 
 import argparse
@@ -28,14 +31,9 @@ from cg_estimation.high_gain import HighGainObserver
 from cg_estimation.kalman import ExtendedKalmanFilter
 
 RESULTS = Path(__file__).resolve().parent / 'results'
-ROBOT = Model.load(model_path('compass_gait_flexible'))
 RIGID = Model.load(model_path('compass_gait_mit'))
 T = 0.002
 SETTINGS = BalanceSettings()
-GAINS = {
-    'rigid': balance_gains(RIGID, SETTINGS, T),
-    'extended': balance_gains(ROBOT, SETTINGS, T, elastic=True),
-}
 LENGTH = 3.0  # s
 HOLD = 5.0  # s
 START = 0.02  # rad, from which 'balances' is judged
@@ -43,18 +41,25 @@ PUSH_AT = 1.0  # s
 SHAKING = 5.0  # N m above 8 Hz: an eighth of what the drive can do, for nothing
 
 
+Make = Callable[[Model, Setup], Estimator]
+
+
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """A row of the table."""
+    """A row of the table: what estimates, on which model, and which filter the torque passes."""
 
     name: str
-    estimator: Callable[[Setup], Estimator]
-    design: str = 'rigid'
+    estimator: Make
+    extended: bool = False
     output_filter_hz: float = 0.0
 
 
-def filtered(kind: str, cutoff: float) -> Callable[[Setup], Estimator]:
-    return lambda setup: Derivative(RIGID, setup, T, kind, cutoff, use_gyro=True)
+def filtered(kind: str, cutoff: float) -> Make:
+    return lambda model, setup: Derivative(model, setup, T, kind, cutoff, use_gyro=True)
+
+
+def observed(epsilon: float) -> Make:
+    return lambda model, setup: HighGainObserver(model, setup, epsilon)
 
 
 VARIANTS = (
@@ -65,40 +70,46 @@ VARIANTS = (
     Variant('first order on output, 20 Hz', filtered('none', 1.0), output_filter_hz=20.0),
     Variant('Chebyshev I, 5th order, 8 Hz', filtered('chebyshev', 8.0)),
     Variant('Chebyshev I, 5th order, 20 Hz', filtered('chebyshev', 20.0)),
-    Variant('observer, eps 0.02', lambda setup: HighGainObserver(RIGID, setup, 0.02)),
-    Variant('observer, eps 0.2', lambda setup: HighGainObserver(RIGID, setup, 0.2)),
-    Variant(
-        'observer, eps 0.02, extended model',
-        lambda setup: HighGainObserver(ROBOT, setup, 0.02),
-        'extended',
-    ),
-    Variant(
-        'observer, eps 0.2, extended model',
-        lambda setup: HighGainObserver(ROBOT, setup, 0.2),
-        'extended',
-    ),
+    Variant('observer, eps 0.02', observed(0.02)),
+    Variant('observer, eps 0.2', observed(0.2)),
+    Variant('observer, eps 0.02, extended model', observed(0.02), extended=True),
+    Variant('observer, eps 0.2, extended model', observed(0.2), extended=True),
     Variant(
         'extended Kalman filter, extended model',
-        lambda setup: ExtendedKalmanFilter(ROBOT, setup, T, disturbance=5.0),
-        'extended',
+        lambda model, setup: ExtendedKalmanFilter(model, setup, T, disturbance=5.0),
+        extended=True,
     ),
 )
 
 
-def run(
-    variant: Variant,
-    stance: str,
-    x0: np.ndarray,
-    seed: int = 0,
-    length: float = LENGTH,
-    pushes: tuple[tuple[float, float], ...] = (),
-    basins: dict | None = None,
-) -> BalanceRun:
-    setup = Setup(stance=stance)
-    settings = dataclasses.replace(SETTINGS, output_filter_hz=variant.output_filter_hz)
-    controller = BalanceController(RIGID, settings, GAINS[variant.design], basins)
-    plant = Plant(ROBOT, setup, x0, T, seed)
-    return balance(plant, variant.estimator(setup), controller, length, pushes)
+class Rig:
+    """A robot, and the laws that are designed for it."""
+
+    def __init__(self, robot: Model):
+        self.robot = robot
+        self.models = {False: RIGID, True: robot}
+        self.gains = {
+            False: balance_gains(RIGID, SETTINGS, T),
+            True: balance_gains(robot, SETTINGS, T, elastic=True),
+        }
+
+    def run(
+        self,
+        variant: Variant,
+        stance: str,
+        x0: np.ndarray,
+        seed: int = 0,
+        length: float = LENGTH,
+        pushes: tuple[tuple[float, float], ...] = (),
+        basins: dict | None = None,
+    ) -> BalanceRun:
+        """The loop with that variant, from x0, shape (4,)."""
+        setup = Setup(stance=stance)
+        settings = dataclasses.replace(SETTINGS, output_filter_hz=variant.output_filter_hz)
+        controller = BalanceController(RIGID, settings, self.gains[variant.extended], basins)
+        plant = Plant(self.robot, setup, x0, T, seed)
+        estimator = variant.estimator(self.models[variant.extended], setup)
+        return balance(plant, estimator, controller, length, pushes)
 
 
 def leaning(lean: float) -> np.ndarray:
@@ -114,7 +125,8 @@ def largest(holds: Callable[[float], bool], high: float, halvings: int = 5) -> f
     return low
 
 
-def row(variant: Variant, stance: str) -> str:
+def row(rig: Rig, variant: Variant, stance: str) -> str:
+    run = rig.run
     motion = run(variant, stance, leaning(START), length=HOLD)
     half = motion.torque[len(motion.torque) // 2 :]
     cells = [variant.name, stance]
@@ -140,10 +152,10 @@ def row(variant: Variant, stance: str) -> str:
     return '| ' + ' | '.join(cells) + ' |'
 
 
-def table() -> Iterator[str]:
-    yield '# Ways to a velocity, in the balancing loop'
+def table(rig: Rig, name: str) -> Iterator[str]:
+    yield f'# Ways to a velocity, in the balancing loop of {rig.robot.name}'
     yield ''
-    yield '`python bench/balance.py`; what the columns mean and what follows: docs/balance.md.'
+    yield f'`python bench/balance.py {name}`; what follows from it: docs/balance.md.'
     yield ''
     yield (
         '| velocities from | stance | balances from 0.02 rad | from how far, rad '
@@ -153,13 +165,13 @@ def table() -> Iterator[str]:
     yield '|---|---|---|---:|---:|---:|---:|---:|'
     for variant in VARIANTS:
         for stance in STANCES:
-            yield row(variant, stance)
-            print(row.__name__, variant.name, stance, flush=True)
+            yield row(rig, variant, stance)
 
 
-def basin() -> Iterator[str]:
+def basin(rig: Rig) -> Iterator[str]:
+    run = rig.run
     variant = next(v for v in VARIANTS if v.name == 'observer, eps 0.2')
-    basins = shipped_basins(RIGID, GAINS['rigid'], RIGID.torque_limit)
+    basins = shipped_basins(RIGID, rig.gains[False], RIGID.torque_limit)
     yield '# Starts inside the stated basin, and ten minutes'
     yield ''
     yield '`python bench/balance.py --basin`; observer with eps 0.2, rigid model.'
@@ -190,10 +202,12 @@ def basin() -> Iterator[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('robot', nargs='?', choices=('flexible', 'imu_mount'), default='flexible')
     parser.add_argument('--basin', action='store_true', help='100 starts and ten minutes')
-    chosen = parser.parse_args().basin
-    text = '\n'.join(basin() if chosen else table()) + '\n'
-    name = 'balance_basin.md' if chosen else 'balance.md'
+    options = parser.parse_args()
+    rig = Rig(Model.load(model_path(f'compass_gait_{options.robot}')))
+    text = '\n'.join(basin(rig) if options.basin else table(rig, options.robot)) + '\n'
+    name = 'balance_basin.md' if options.basin else f'balance_{options.robot}.md'
     write_atomically(RESULTS / name, text)
     print(text)
 

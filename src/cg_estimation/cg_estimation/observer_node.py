@@ -25,7 +25,7 @@ from cg_estimation.samples import Gatherer
 
 NOMINAL_MODEL = 'compass_gait_mit'
 LOADED = 0.5  # N, or the 1 of a plain switch
-ROTOR = 'hip_rotor'
+ROTOR, ROTOR_STATE = 'hip_rotor', 'joint_flexibility.rotor_angle'
 NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
 REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
 
@@ -54,9 +54,12 @@ class ObserverNode(Node):
             settings, Model.load(path), Setup(stance='inner' if told else settings.stance)
         )
         self.gatherer = Gatherer(contacts=told)
-        rotor = len(self.estimator.state_names) == 6
-        self.message = JointState(name=[*STANCES, *([ROTOR] if rotor else [])])
-        self._order = [0, 1, 4] if rotor else [0, 1]
+        # Other states of effects, of sensors say, are of no use to a controller.
+        self._angles, self._rates = [0, 1], [2, 3]
+        if ROTOR_STATE in self.estimator.state_names:
+            rotor = self.estimator.state_names.index(ROTOR_STATE)
+            self._angles, self._rates = [0, 1, rotor], [2, 3, rotor + 1]
+        self.message = JointState(name=[*STANCES, ROTOR][: len(self._angles)])
         self._published = 0
         self._withheld = 0
         self._longest = 0.0
@@ -158,9 +161,8 @@ class ObserverNode(Node):
         x = estimate.x
         self.message.header.stamp = to_stamp(estimate.stamp_ns)
         self.message.header.frame_id = f'{estimate.stance}_foot'
-        self.message.position = [float(x[i]) for i in self._order]
-        rates = [2, 3, 5] if len(self._order) == 3 else [2, 3]
-        self.message.velocity = [float(x[i]) for i in rates]
+        self.message.position = [float(x[i]) for i in self._angles]
+        self.message.velocity = [float(x[i]) for i in self._rates]
         self.publisher.publish(self.message)
         self._published += 1
 

@@ -171,3 +171,10 @@ def test_extended_model_publishes_the_rotor_too(bench):
     assert list(machine.states[-1].name) == ['inner', 'outer', 'hip_rotor']
     # At rest the rotor stands where the joint does.
     assert machine.states[0].position[2] == pytest.approx(0.3)
+
+
+def test_states_of_sensors_are_not_taken_for_a_rotor(bench):
+    machine, make, until = bench
+    make(model_file=str(model_path('compass_gait_imu_mount')))
+    run(machine, until, range(2))
+    assert list(machine.states[-1].name) == ['inner', 'outer']
