@@ -44,6 +44,7 @@ setup(
             'balance = cg_bringup.balance_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
+            'replay = cg_bringup.replay:main',
         ],
     },
 )

@@ -8,6 +8,7 @@ repeated measurement (lock-step) is answered by the same state.
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
@@ -48,7 +49,8 @@ class ObserverNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, ObserverNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        path = settings.model_file or model_path(NOMINAL_MODEL)
+        given = settings.model_file
+        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
         told = settings.stance == 'contacts'
         self.estimator = make_estimator(
             settings, Model.load(path), Setup(stance='inner' if told else settings.stance)
