@@ -17,7 +17,7 @@ import numpy as np
 
 from cg_control.linearise import DRY_FRICTION
 from cg_control.trajectory import Phase, Trajectory
-from cg_control.transcription import KNOT, Structure, Transcription, transcribe
+from cg_control.transcription import KNOT, RATE_SCALE, Structure, Transcription, transcribe
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
@@ -318,8 +318,9 @@ class Program:
         ])  # fmt: skip
         t = self.transcription
         self.lower, self.upper = t.lower.copy(), t.upper.copy()
-        for rows in [t.rows_of.get('rate', [])]:
-            self.lower[rows], self.upper[rows] = -task.rate_limit / 100, task.rate_limit / 100
+        if 'rate' in t.rows_of:
+            limit = task.rate_limit / RATE_SCALE
+            self.lower[t.rows_of['rate']], self.upper[t.rows_of['rate']] = -limit, limit
         self.x_lower, self.x_upper = self._bounds(elastic)
 
     def _columns(self) -> Iterator[tuple[int, int, int, int]]:

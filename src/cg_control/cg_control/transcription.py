@@ -11,8 +11,8 @@ Accelerations a are unknowns, so that no M^-1 is ever differentiated: same solut
 dx/dt = f(x, u), a tenth of the operations in second derivatives. Between phases stands the impact
 map (IMP). Phase durations T are unknowns.
 
-The program has the shape of an optimal control problem, so that fatrop factors it stage by stage
-in time linear in n: the state of a stage is its knot (x, a, u) and T, its control is the next knot,
+The program has the shape of an optimal control problem, so that fatrop factors it stage by stage,
+in time linear in n: the state of a stage is its knot (x, a, u) and T, its control the next knot,
 
     s+ = (w, T),   g(s, w) = 0  or within bounds.                                    (OCP)
 
@@ -21,31 +21,31 @@ one symbolic expression per mode, mapped over the stages, generated to C and cac
 """
 
 import functools
-import hashlib
-import platform
-from collections.abc import Sequence
+import logging
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import assemble, parameter_names
-from cg_dynamics.compiled import FLAGS, _compile, _cpu, cache_directory, compiler
+from cg_dynamics.assemble import acting_effects, assemble, parameter_names
+from cg_dynamics.compiled import FLAGS, compiler, shared_library
 from cg_dynamics.hybrid import other
 from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
+log = logging.getLogger(__name__)
+
 KNOT = 7  # q (2), v (2), a (2), u
 TORQUE_SCALE = 10.0  # N m; brings (ID) to the size of the other rows
+RATE_SCALE = 100.0  # N m/s
 CLEARANCE_WIDTH = 0.01  # m of reach over which a retracted foot comes down
 TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
 GOAL_PARAMETERS = {'box': 8, 'region': 20}  # bounds; center and form
 MISS_SCALE = np.array([0.1, 0.1, 0.3, 0.3])  # rad, rad/s: misses of the goal worth the same
-# Straight-line code with a few loops: higher levels compile for a minute and gain nothing.
+# Long straight-line code: higher levels take minutes to compile it and gain nothing.
 FLAGS_HERE = ('-O1', *(flag for flag in FLAGS if flag not in ('-O2', '-ftree-vectorize')))
 
 
@@ -79,11 +79,15 @@ class Structure:
                 raise ValueError(f'modes: {mode!r} is not one of {", ".join(STANCES)}')
         for before, after in zip(self.modes, self.modes[1:], strict=False):
             if before == after:
-                raise ValueError(f'modes: {before!r} follows {before!r}; an impact changes the leg')
+                raise ValueError(f'modes: {before!r} twice in a row; an impact changes the leg')
         if len(self.intervals) != len(self.modes) or not self.modes:
-            raise ValueError('modes and intervals must have the same number of entries, at least 1')
+            raise ValueError('modes and intervals must have the same number of entries')
         if min(self.intervals) < 2:
             raise ValueError(f'intervals are {self.intervals}; each phase needs at least 2')
+
+
+# Name, expression, lower and upper bound.
+Row = tuple[str, Any, float, float]
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ class Block:
         jacobian: (z, p) -> d rows/dz, dense.
         hessian: (z, p, cost factor, multipliers) -> second derivative of the Lagrangian, dense.
         gradient: (z, p) -> gradient of the cost.
-        lower: Bounds of the rows, NaN where the task sets them by `names`.
+        lower: Bounds of the rows, NaN where the task sets them.
         upper: As `lower`.
         names: Of the rows.
     """
@@ -109,7 +113,7 @@ class Block:
     names: tuple[str, ...]
 
 
-def _block(name: str, z: ca.SX, p: ca.SX, rows: list[tuple[str, Any, float, float]], cost) -> Block:
+def _block(name: str, z: ca.SX, p: ca.SX, rows: list[Row], cost) -> Block:
     expressions = ca.vertcat(*(row[1] for row in rows)) if rows else ca.SX(0, 1)
     names = [row[0] for row in rows for _ in range(ca.SX(row[1]).shape[0])]
     lower = [row[2] for row in rows for _ in range(ca.SX(row[1]).shape[0])]
@@ -210,7 +214,7 @@ class Transcription:
             if self.memory:
                 rows.append(('memory', s[8:] - x, 0.0, 0.0))
         if self.structure.rate_limited:
-            rows.append(('rate', (u_next - u) / h / 100, np.nan, np.nan))
+            rows.append(('rate', (u_next - u) / h / RATE_SCALE, np.nan, np.nan))
         if self.structure.clearance:
             q, v = ca.SX.sym('q', 2), ca.SX.sym('v', 2)
             height, _, reach = self._foot(q, v, mode)
@@ -236,9 +240,7 @@ class Transcription:
             (_, height, *_), (_, approach, *_), (_, reach, *_) = rows
             miss = height**2 + ca.fmin(approach, 0) ** 2 + 100 * ca.fmin(reach, 0) ** 2
             rows = []
-        v_plus, impulse, foot_velocity, _ = impact_function(self._model, mode)(
-            s[:2], s[2:4], self._parameters()[0]
-        )
+        v_plus = impact_function(self._model, mode)(s[:2], s[2:4], self._parameters()[0])[0]
         return v_plus, rows, miss
 
     def _jump(self, mode: str) -> Block:
@@ -257,7 +259,7 @@ class Transcription:
 
     def _last(self, mode: str) -> Block:
         s = ca.SX.sym('s', self.nx)
-        rows: list[tuple[str, Any, float, float]] = []
+        rows: list[Row] = []
         miss: Any = 0
         self._parameters()
         if self.structure.periodic:
@@ -326,12 +328,19 @@ class Transcription:
 
     def _assembled(self) -> list[ca.Function]:
         """The functions of the program: f, g, gradient, Jacobian, Hessian, under their names."""
-        z = ca.MX.sym('x', self.size)
-        p = ca.MX.sym('p', self.parameter_count)
-        lam_f, lam_g = ca.MX.sym('lam_f'), ca.MX.sym('lam_g', len(self.names))
+        z: Any = ca.MX.sym('x', self.size)
+        p: Any = ca.MX.sym('p', self.parameter_count)
+        lam_f: Any = ca.MX.sym('lam_f')
+        lam_g: Any = ca.MX.sym('lam_g', len(self.names))
         f: Any = 0
-        g, gradient, hessian_parts, jacobian_parts = [], [], [], []
-        rows_j, cols_j, rows_h, cols_h = [], [], [], []
+        g: Any = []
+        gradient: Any = []
+        hessian_parts: list[Any] = []
+        jacobian_parts: list[Any] = []
+        rows_j: list[np.ndarray] = []
+        cols_j: list[np.ndarray] = []
+        rows_h: list[np.ndarray] = []
+        cols_h: list[np.ndarray] = []
         constants: list[tuple[int, int, float]] = []
         column, row = 0, 0
         for block, count, kind in self._runs:
@@ -419,20 +428,17 @@ class Transcription:
         return {function.name(): function for function in self._functions}
 
     @functools.cached_property
-    def library(self) -> Path:
-        """The compiled program; built once per structure."""
+    def _program(self) -> Any:
+        """What nlpsol takes: the compiled program, or its symbols where there is no compiler."""
+        if compiler() is None:
+            log.warning('no C compiler found: planning runs on the CasADi virtual machine, slower')
+            z, p = ca.MX.sym('x', self.size), ca.MX.sym('p', self.parameter_count)
+            f, g = self._functions[0](z, p)
+            return {'x': z, 'p': p, 'f': f, 'g': g}
         generator = ca.CodeGenerator('cgt', {'with_header': False})
         for function in self._functions:
             generator.add(function)
-        source = generator.dump()
-        gcc = compiler()
-        if gcc is None:
-            raise RuntimeError('planning needs a C compiler; none was found (cc, gcc, clang)')
-        key = '\n'.join([source, *FLAGS_HERE, gcc, platform.machine(), _cpu()])
-        target = cache_directory() / f'{hashlib.sha256(key.encode()).hexdigest()[:32]}.so'
-        if not target.exists():
-            _compile(source, target, gcc, FLAGS_HERE)
-        return target
+        return str(shared_library(generator.dump(), FLAGS_HERE))
 
     def solver(self, iterations: int, tolerance: float) -> ca.Function:
         """Fatrop on the compiled program."""
@@ -440,7 +446,7 @@ class Transcription:
         if key not in self._solvers:
             equality = (self.lower == self.upper).tolist()
             self._solvers[key] = ca.nlpsol(
-                'cgt', 'fatrop', str(self.library),
+                'cgt', 'fatrop', self._program,
                 {
                     'print_time': False, 'structure_detection': 'manual',
                     'N': len(self._nx) - 1, 'nx': self._nx, 'nu': self._nu, 'ng': self._ng,
@@ -455,7 +461,7 @@ class Transcription:
         return {}
 
 
-def _scattered(shape: tuple[int, int], rows: np.ndarray, cols: np.ndarray, values) -> ca.MX:
+def _scattered(shape: tuple[int, int], rows: np.ndarray, cols: np.ndarray, values) -> Any:
     """A sparse matrix from its nonzeros in any order."""
     order = np.lexsort((rows, cols))
     starts = np.concatenate([[0], np.cumsum(np.bincount(cols, minlength=shape[1]))])
@@ -468,17 +474,12 @@ _made: dict[tuple, Transcription] = {}
 
 def transcribe(model: Model, structure: Structure) -> Transcription:
     """The program of a model's structure; quick when it was built before in this process."""
-    acting = tuple((e.name, e.at) for e in model.effects)
-    key = (model.mechanism.name, acting, tuple(_neutral(model)), structure)
+    key = (
+        model.mechanism.name,
+        tuple((e.name, e.at) for e in model.effects),
+        tuple(e.label for e in acting_effects(model)),
+        structure,
+    )
     if key not in _made:
         _made[key] = Transcription(model, structure)
     return _made[key]
-
-
-def _neutral(model: Model) -> Sequence[str]:
-    from cg_dynamics.assemble import acting_effects
-
-    return [effect.label for effect in acting_effects(model)]
-
-
-__all__ = ['GOAL_PARAMETERS', 'KNOT', 'MISS_SCALE', 'TASK_PARAMETERS', 'Structure', 'Transcription', 'transcribe']

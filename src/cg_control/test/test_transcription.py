@@ -37,7 +37,7 @@ def test_derivatives_are_those_of_the_rows(robot, structure):
     multipliers = rng.normal(size=len(program.names))
     g, jacobian = (np.array(a) for a in functions['nlp_jac_g'](z, p))
     gamma, hessian = (np.array(a) for a in functions['nlp_hess_l'](z, p, 1.3, multipliers))
-    f, again = functions['nlp'](z, p)
+    _, again = functions['nlp'](z, p)
     np.testing.assert_array_equal(np.array(again), g)
     step = 1e-5
     for i in rng.permutation(program.size)[:25]:
