@@ -14,28 +14,27 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from cg_dynamics.linearise import Linearisation, linearise
+from cg_dynamics.compiled import compile_model
+from cg_dynamics.linearise import Linearisation, linearise, without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
-# Friction whose slope at standstill is an artefact of smoothing.
-DRY_FRICTION = (
-    'coulomb_friction', 'stribeck_friction', 'presliding_friction', 'load_dependent_friction',
-    'position_dependent_friction', 'asymmetric_friction', 'friction_drift', 'ankle_friction',
-)  # fmt: skip
 # They change what is commanded, read or met on the way, not how the bodies move.
 NOT_DESIGNED_ON = ('command', 'transmission', 'sensor', 'timing')
 
 
-def design_model(model: Model) -> Model:
-    """The model without extra states, delays, sensor errors and dry friction."""
+def design_model(model: Model, elastic: bool = False) -> Model:
+    """The model without extra states, delays, sensor errors and dry friction.
+
+    Args:
+        model: A compass gait.
+        elastic: Keep the states of the transmission, for a regulator of rotor and joint.
+    """
+    model = without_dry_friction(model)
     for effect in model.effects:
-        if (
-            effect.states
-            or effect.extra_inputs
-            or effect.name in DRY_FRICTION
-            or effect.place in NOT_DESIGNED_ON
-        ):
+        keep = elastic and effect.place == 'transmission' and not effect.extra_inputs
+        drop = effect.states or effect.extra_inputs or effect.place in NOT_DESIGNED_ON
+        if drop and not keep:
             model = model.without_effect(effect.label)
     return model
 
@@ -45,19 +44,22 @@ def linearise_stance(
     stance: str,
     x0: np.ndarray | None = None,
     u0: np.ndarray | None = None,
+    elastic: bool = False,
 ) -> Linearisation:
     """The design model near a state, while one leg stands.
 
     Args:
         model: A compass gait; its design model is taken.
         stance: 'inner' or 'outer'.
-        x0: (q_inner, q_outer) and rates, shape (4,), rad and rad/s; None: upright at rest, which
-            is an equilibrium.
+        x0: State, shape (nx,), rad and rad/s: (q_inner, q_outer), rates, states of the
+            transmission if elastic; None: upright at rest, which is an equilibrium.
         u0: Hip torque, shape (1,), N m; None: zero.
+        elastic: Keep the states of the transmission.
     """
-    x0 = np.zeros(4) if x0 is None else np.asarray(x0, float)
+    design, setup = design_model(model, elastic), Setup(stance=stance)
+    x0 = np.zeros(compile_model(design, setup).nx) if x0 is None else np.asarray(x0, float)
     u0 = np.zeros(1) if u0 is None else np.asarray(u0, float)
-    return linearise(design_model(model), Setup(stance=stance), x0, u0)
+    return linearise(design, setup, x0, u0)
 
 
 @dataclass(frozen=True)
@@ -93,5 +95,3 @@ def discretise(linear: Linearisation, sample_time: float) -> DiscreteLinearisati
     return DiscreteLinearisation(
         held[:, :nx], held[:, nx : nx + nu], held[:, nx + nu], sample_time
     )
-
-

@@ -17,6 +17,12 @@ from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
+# Friction whose slope at standstill is an artefact of its smoothing.
+DRY_FRICTION = (
+    'coulomb_friction', 'stribeck_friction', 'presliding_friction', 'load_dependent_friction',
+    'position_dependent_friction', 'asymmetric_friction', 'friction_drift', 'ankle_friction',
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Linearisation:
@@ -71,3 +77,11 @@ def linearise(model: Model, setup: Setup, x0: np.ndarray, u0: np.ndarray) -> Lin
     results = jacobians(compiled)(x0, u0, parameter_vector(model, setup))
     A, B, C, D, rates, outputs = (np.asarray(result) for result in results)
     return Linearisation(A, B, C, D, rates.ravel(), outputs.ravel(), compiled.state_names)
+
+
+def without_dry_friction(model: Model) -> Model:
+    """What a linear design may be made on: tanh(v / 0.01 rad/s) is no viscous friction."""
+    for effect in model.effects:
+        if effect.name in DRY_FRICTION:
+            model = model.without_effect(effect.label)
+    return model

@@ -1,0 +1,165 @@
+"""From where the balance controller catches the robot: sampled, docs/balance.md, "The basin".
+
+Upright, a stance phase has one unstable, one stable and one oscillating mode. In the coordinates
+of these modes a state is
+
+    capture   z, the unstable coordinate, as a lean in rad: legs parallel at rest leaning z;
+    stable    the coordinate that dies out by itself, in the same measure;
+    swing     a, the amplitude in rad of the swing leg's oscillation.                  (MODES)
+
+A limited torque cannot catch a large z whatever else is true, and the more the swing leg is
+already moving, the less it can. So the basin is a sampled bound c(a) on |z|: from every one of the
+sampled states with |z| = c(a), stable coordinate within |z| and any phase of the swing, the
+closed loop of the nonlinear model, friction and torque limit included, came to rest.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cg_control.linearise import linearise_stance
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import compile_model
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES, Setup
+
+SWINGS = (0.0, 0.1, 0.2, 0.3)  # rad
+SAMPLES = 24  # states tried at each swing amplitude and capture coordinate
+HALVINGS = 6
+LARGEST = 0.16  # rad: beyond what 40 N m can hold back in the linear model
+DURATION = 4.0  # s
+SAMPLE_TIME = 0.002  # s
+AT_REST = 0.05  # rad and rad/s of the stance leg at the end
+FALLEN = 0.5  # rad
+
+
+@dataclass(frozen=True)
+class Modes:
+    """(MODES) of one stance leg.
+
+    Attributes:
+        to_modes: x -> (capture, stable, swing cosine, swing sine), shape (4, 4).
+        to_state: Its inverse.
+    """
+
+    to_modes: np.ndarray
+    to_state: np.ndarray
+
+    def split(self, x: np.ndarray) -> tuple[float, float, float]:
+        """Capture, stable coordinate and swing amplitude of a state, rad."""
+        capture, stable, cosine, sine = self.to_modes @ x[:4]
+        return float(capture), float(stable), float(np.hypot(cosine, sine))
+
+    def state(self, capture: float, stable: float, swing: float, phase: float) -> np.ndarray:
+        """State (4,) of these coordinates."""
+        modes = [capture, stable, swing * np.cos(phase), swing * np.sin(phase)]
+        return self.to_state @ np.array(modes)
+
+
+def modes_of(model: Model, stance: str) -> Modes:
+    """(MODES) of a model's linearisation upright; friction, which damps the swing, left out."""
+    for effect in model.effects:
+        if effect.place == 'joint':
+            model = model.without_effect(effect.label)
+    linear = linearise_stance(model, stance)
+    values, left = np.linalg.eig(linear.A.T)
+    parallel = np.array([1.0, 1.0, 0.0, 0.0])
+    swinging = np.array([0.0, 1.0, 0.0, 0.0] if stance == 'inner' else [1.0, 0.0, 0.0, 0.0])
+    rows = []
+    for value in (values.real.argmax(), values.real.argmin()):
+        row = left[:, value].real
+        rows.append(row / (row @ parallel))
+    row = left[:, values.imag.argmax()]
+    row = row / (row @ swinging)
+    to_modes = np.array([*rows, row.real, row.imag])
+    return Modes(to_modes, np.linalg.inv(to_modes))
+
+
+@dataclass(frozen=True)
+class Basin:
+    """|capture| <= bound(swing), |stable| <= bound(swing).
+
+    Attributes:
+        modes: Coordinates in which it is said.
+        bounds: c(a) in rad at the amplitudes SWINGS; beyond the last one nothing is inside.
+    """
+
+    modes: Modes
+    bounds: tuple[float, ...]
+
+    def bound(self, swing: float) -> float:
+        """c(a) in rad; zero beyond the amplitudes that were sampled."""
+        return float(np.interp(swing, SWINGS, self.bounds, right=0.0))
+
+    def depth(self, x: np.ndarray) -> float:
+        """How far out a state is, as a share of the bound: inside if 1 or less."""
+        capture, stable, swing = self.modes.split(x)
+        bound = self.bound(swing)
+        return max(abs(capture), abs(stable)) / bound if bound > 0 else float('inf')
+
+    def draw(self, rng: np.random.Generator, share: float = 1.0) -> np.ndarray:
+        """A random state (4,) inside, or inside a share of it."""
+        swing = rng.uniform(0.0, SWINGS[-1])
+        reach = share * self.bound(swing)
+        return self.modes.state(
+            rng.uniform(-reach, reach),
+            rng.uniform(-reach, reach),
+            swing,
+            rng.uniform(0, 2 * np.pi),
+        )
+
+
+def sample_basin(
+    model: Model, stance: str, gain: np.ndarray, torque_limit: float, seed: int = 0
+) -> Basin:
+    """Sample the basin of u = clip(-K x) on the nonlinear model.
+
+    Args:
+        model: Its effects without extra states take part, dry friction among them.
+        stance: Stance leg.
+        gain: K, of the first four states, shape (4,).
+        torque_limit: In N m.
+        seed: Of the directions.
+    """
+    modes = modes_of(model, stance)
+    for effect in model.effects:
+        if effect.states or effect.extra_inputs:
+            model = model.without_effect(effect.label)
+    caught = _Trial(model, stance, gain, torque_limit)
+    bounds: list[float] = []
+    for swing in SWINGS:
+        rng = np.random.default_rng(seed)
+        shapes = [
+            ((-1.0) ** i, rng.uniform(-1, 1), rng.uniform(0, 2 * np.pi)) for i in range(SAMPLES)
+        ]
+        low, high = 0.0, bounds[-1] if bounds else LARGEST
+        for _ in range(HALVINGS):
+            z = (low + high) / 2
+            states = [modes.state(sign * z, s * z, swing, phase) for sign, s, phase in shapes]
+            low, high = (z, high) if all(map(caught, states)) else (low, z)
+        bounds.append(low)
+    return Basin(modes, tuple(bounds))
+
+
+class _Trial:
+    def __init__(self, model: Model, stance: str, gain: np.ndarray, torque_limit: float):
+        setup = Setup(stance=stance)
+        self.compiled, self.p = compile_model(model, setup), parameter_vector(model, setup)
+        self.gain, self.limit = np.asarray(gain, float).ravel()[:4], torque_limit
+        self.standing = STANCES.index(stance)
+
+    def __call__(self, x0: np.ndarray) -> bool:
+        x, u = x0.copy(), np.ones(self.compiled.nu)
+        for _ in range(round(DURATION / SAMPLE_TIME)):
+            u[0] = min(max(-float(self.gain @ x), -self.limit), self.limit)
+            self.compiled.advance(x, u, self.p, SAMPLE_TIME / 2, 2)
+            if not abs(x[self.standing]) < FALLEN:
+                return False
+        return abs(x[self.standing]) < AT_REST and abs(x[2 + self.standing]) < AT_REST
+
+
+def basin_to_dict(basins: Mapping[str, Basin]) -> dict[str, Any]:
+    """Stance -> bounds, as they are shipped."""
+    return {stance: [round(b, 6) for b in basin.bounds] for stance, basin in basins.items()}
