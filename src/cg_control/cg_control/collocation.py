@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from cg_control.linearise import DRY_FRICTION
 from cg_control.trajectory import Phase, Trajectory
 from cg_control.transcription import KNOT, RATE_SCALE, Structure, Transcription, transcribe
 from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.linearise import DRY_FRICTION
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
