@@ -41,6 +41,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
+            'balance = cg_bringup.balance_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
         ],

@@ -29,10 +29,20 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'casadi',
+        'cg_description',
         'cg_dynamics',
         'numpy',
         'scipy',
+        'PyYAML',
     ],
     extras_require={'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'balance_node = cg_control.balance_node:main',
+            'playback_node = cg_control.playback_node:main',
+            'trajectory_server_node = cg_control.trajectory_server_node:main',
+            'tvlqr_node = cg_control.tvlqr_node:main',
+        ],
+    },
 )

@@ -28,10 +28,17 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=[
+        'casadi',
+        'cg_description',
         'cg_dynamics',
         'numpy',
         'scipy',
     ],
     extras_require={'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'observer_node = cg_estimation.observer_node:main',
+        ],
+    },
 )

@@ -14,7 +14,7 @@ armed again), and at once when the state is not finite.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def balance_gains(
     gains = {}
     for stance in STANCES:
         linear = linearise_stance(model, stance, elastic=elastic)
-        sampled = discretise(linear, sample_time)
+        to_slow, from_slow = slow_modes(linear.A)
         scales = [
             settings.lean_scale,
             settings.swing_scale,
@@ -130,13 +130,40 @@ def balance_gains(
         ]
         if stance == 'outer':
             scales = [scales[1], scales[0], scales[3], scales[2]]
-        q = np.zeros(len(linear.A))
-        q[:4] = sample_time / np.square(scales)
+        Q = np.zeros(linear.A.shape)
+        Q[[0, 1, 2, 3], [0, 1, 2, 3]] = sample_time / np.square(scales)
+        slow = replace(
+            linear,
+            A=to_slow @ linear.A @ from_slow,
+            B=to_slow @ linear.B,
+            rates=to_slow @ linear.rates,
+        )
+        sampled = discretise(slow, sample_time)
         try:
-            gains[stance] = dlqr(sampled.A, sampled.B, np.diag(q), R).K[0]
+            regulator = dlqr(sampled.A, sampled.B, from_slow.T @ Q @ from_slow, R)
+            gains[stance] = (regulator.K @ to_slow)[0]
         except LqrError as error:
             raise LqrError(f'no gains for the {stance} leg as stance: {error}') from None
     return gains
+
+
+def slow_modes(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The four slowest modes of dx/dt = A x: x -> modes (4, nx) and back (nx, 4).
+
+    A regulator of these alone neither sees nor is asked to damp the vibration of the transmission,
+    which at the gains of balancing no delayed torque could. Of a rigid model these are all.
+    """
+    if len(A) == 4:
+        return np.eye(4), np.eye(4)
+    values, vectors = np.linalg.eig(A)
+    columns = []
+    for index in np.argsort(np.abs(values), kind='stable'):
+        if values[index].imag >= 0:
+            columns.append(vectors[:, index].real)
+        if values[index].imag > 0:
+            columns.append(vectors[:, index].imag)
+    basis = np.column_stack(columns)
+    return np.linalg.inv(basis)[:4], basis[:, :4]
 
 
 class BalanceController:

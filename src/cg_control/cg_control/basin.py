@@ -9,15 +9,24 @@ of these modes a state is
 
 A limited torque cannot catch a large z whatever else is true, and the more the swing leg is
 already moving, the less it can. So the basin is a sampled bound c(a) on |z|: from every one of the
-sampled states with |z| = c(a), stable coordinate within |z| and any phase of the swing, the
-closed loop of the nonlinear model, friction and torque limit included, came to rest.
+sampled states with |z| = c(a) / MARGIN, stable coordinate within |z| and any phase of the swing,
+the closed loop of the nonlinear model, friction and torque limit included, came to rest. That loop
+knows its state; MARGIN leaves room for an observer, delay and elasticity.
+
+Sampling takes some ten seconds a leg, so the basins of the default weights are shipped
+(config/balance_basins.yaml, made by bench/balance_basins.py). The node has those of
+other weights sampled in a process of its own and does not engage before they are there.
 """
 
+import argparse
+import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
+import yaml
 
 from cg_control.linearise import linearise_stance
 from cg_dynamics.assemble import parameter_vector
@@ -31,6 +40,7 @@ HALVINGS = 6
 LARGEST = 0.16  # rad: beyond what 40 N m can hold back in the linear model
 DURATION = 4.0  # s
 SAMPLE_TIME = 0.002  # s
+MARGIN = 0.9
 AT_REST = 0.05  # rad and rad/s of the stance leg at the end
 FALLEN = 0.5  # rad
 
@@ -140,7 +150,7 @@ def sample_basin(
             states = [modes.state(sign * z, s * z, swing, phase) for sign, s, phase in shapes]
             low, high = (z, high) if all(map(caught, states)) else (low, z)
         bounds.append(low)
-    return Basin(modes, tuple(bounds))
+    return Basin(modes, tuple(round(MARGIN * bound, 5) for bound in bounds))
 
 
 class _Trial:
@@ -160,6 +170,48 @@ class _Trial:
         return abs(x[self.standing]) < AT_REST and abs(x[2 + self.standing]) < AT_REST
 
 
-def basin_to_dict(basins: Mapping[str, Basin]) -> dict[str, Any]:
-    """Stance -> bounds, as they are shipped."""
-    return {stance: [round(b, 6) for b in basin.bounds] for stance, basin in basins.items()}
+def shipped_file() -> Path:
+    """Where the shipped basins are: beside the sources, or in the share directory."""
+    package = Path(__file__).resolve().parent
+    name = Path('config') / 'balance_basins.yaml'
+    for folder in (package.parent, *(p / 'share' / 'cg_control' for p in package.parents)):
+        if (folder / name).is_file():
+            return folder / name
+    return package.parent / name
+
+
+def shipped_basins(
+    model: Model, gains: Mapping[str, np.ndarray], torque_limit: float
+) -> dict[str, Basin] | None:
+    """The shipped basins, if they are of this model, these gains and this limit."""
+    try:
+        entries = yaml.safe_load(shipped_file().read_text(encoding='utf-8'))
+    except OSError:
+        return None
+    for entry in entries:
+        same = entry['model_sha256'] == model.hash and entry['torque_limit'] == torque_limit
+        # Gains are printed with 6 digits; a basin does not change with the seventh.
+        if same and all(
+            np.allclose(gains[s][:4], entry['gains'][s], rtol=1e-5, atol=1e-5) for s in STANCES
+        ):
+            return {s: Basin(modes_of(model, s), tuple(entry['bounds'][s])) for s in STANCES}
+    return None
+
+
+def main(args: list[str] | None = None) -> int:
+    """Sample a basin and print its bounds as JSON: what the node starts as a process."""
+    parser = argparse.ArgumentParser(prog='python -m cg_control.basin', description=__doc__)
+    parser.add_argument('model', help='model file')
+    parser.add_argument('stance', choices=STANCES)
+    parser.add_argument('torque_limit', type=float, help='N m')
+    parser.add_argument('gain', type=float, nargs=4, help='K of the four states')
+    options = parser.parse_args(args)
+    basin = sample_basin(
+        Model.load(options.model), options.stance, np.array(options.gain), options.torque_limit
+    )
+    print(json.dumps(list(basin.bounds)))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -220,17 +220,25 @@ class Trajectory:
             TrajectoryError: for a file that is none, or one of another model.
         """
         try:
-            content = json.loads(Path(path).read_text(encoding='utf-8'))
-        except OSError as error:
-            raise TrajectoryError(f'{path}: {error.strerror}') from None
-        except ValueError as error:
-            raise TrajectoryError(f'{path}: not JSON: {error}') from None
+            text = Path(path).read_text(encoding='utf-8')
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, 'strerror', None) or error
+            raise TrajectoryError(f'{path}: {reason}') from None
         try:
-            trajectory = cls._from_content(content)
-            if model is not None:
-                trajectory.require_model(model)
+            return cls.from_text(text, model)
         except TrajectoryError as error:
             raise TrajectoryError(f'{path}: {error}') from None
+
+    @classmethod
+    def from_text(cls, text: str, model: Model | None = None) -> 'Trajectory':
+        """Read the text of a file, as it travels on a topic; otherwise as `load`."""
+        try:
+            content = json.loads(text)
+        except ValueError as error:
+            raise TrajectoryError(f'not JSON: {error}') from None
+        trajectory = cls._from_content(content)
+        if model is not None:
+            trajectory.require_model(model)
         return trajectory
 
     @classmethod

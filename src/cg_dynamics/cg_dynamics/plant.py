@@ -10,6 +10,7 @@ import bisect
 import itertools
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 from scipy.optimize import brentq
 
@@ -99,6 +100,7 @@ class Plant:
         # One stream per channel: adding a channel must not change the noise of another.
         streams = np.random.SeedSequence(seed).spawn(len(self._compiled.channels))
         self._noise = [np.random.default_rng(stream) for stream in streams]
+        self._jolt: ca.Function | None = None
         self._fine = min(FINE_STEP, self._compiled.largest_step / 4)
 
     @property
@@ -168,10 +170,31 @@ class Plant:
         landed = impact(self.model, self.stance, x)
         self.stance, self._x = landed.stance, landed.x_plus
         self._compiled = compile_model(self.model, replace(self.setup, stance=self.stance))
+        self._jolt = None
         self._compiled.advance(self._x, u, self._p, (duration - instant) / steps, steps)
 
     def _height(self, x: np.ndarray) -> float:
         return swing_foot(x, self.stance, self.model.values['leg_length'])[1]
+
+    def push(self, impulse: float) -> None:
+        """Somebody hits the hip of a compass gait: the rates jump by M^-1 J' P at once.
+
+        Args:
+            impulse: Horizontal impulse P in N s, positive forward.
+        """
+        if self._jolt is None:
+            e, stance = self._compiled.equations, self.stance
+            m = e.coordinates
+            q = e.x[:m]
+            lean = q[self.model.mechanism.bodies.index(stance)]
+            length = self.model.values['leg_length']
+            jacobian = ca.jacobian(length * ca.sin(lean), q)
+            jump = ca.solve(e.mass_matrix, jacobian.T)
+            self._jolt = ca.Function('jolt', [e.x, e.p], [jump])
+        m = self._compiled.equations.coordinates
+        jolt = np.asarray(self._jolt(self._x, self._p)).ravel()
+        self._x[m : 2 * m] += impulse * jolt
+        self._past[-1] = (self._past[-1][0], self._x.copy())
 
     def measure(self) -> Measurement:
         """Read all sensors now."""
@@ -220,11 +243,7 @@ class Plant:
         h, s = t1 - t0, (t - t0) / (t1 - t0)
         d0, d1 = (np.asarray(self._compiled.f(x, u, self._p)).ravel() for x in (x0, x1))
         r = 1 - s
-        return (
-            (1 + 2 * s) * r**2 * x0
-            + (1 + 2 * r) * s**2 * x1
-            + h * s * r * (r * d0 - s * d1)
-        )
+        return (1 + 2 * s) * r**2 * x0 + (1 + 2 * r) * s**2 * x1 + h * s * r * (r * d0 - s * d1)
 
     def _contact(self) -> dict[str, float]:
         if self.model.mechanism.name != 'compass_gait':

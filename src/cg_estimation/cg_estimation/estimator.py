@@ -152,7 +152,7 @@ class StampedEstimator:
         return self._conclude(stamp_ns, y, last.running + gap)
 
     def _start(self, stamp_ns: int, torque: float, y: np.ndarray, stance: str) -> Estimate:
-        """At the measured pose; the swing rate, which no sensor tells, is taken to be zero."""
+        """At the measured pose; of the rates only the one that the gyro tells is known."""
         self.restarts += self._estimate is not None
         self.stance = stance
         reading = dict(zip(self.channels, np.where(np.isnan(y), 0.0, y), strict=True))
@@ -160,7 +160,9 @@ class StampedEstimator:
         rate = reading.get('imu_rate', 0.0)
         self._start_ns = stamp_ns
         self._seen = dict.fromkeys(self.channels, -math.inf)
-        self._begin(np.array([lean, lean - hip, rate, rate]), torque)
+        # A stance leg that does not turn, a swing leg that goes with it.
+        outer = rate if stance == 'inner' else 0.0
+        self._begin(np.array([lean, lean - hip, rate, outer]), torque)
         return self._conclude(stamp_ns, y, 0.0)
 
     def _conclude(self, stamp_ns: int, y: np.ndarray, running: float) -> Estimate:

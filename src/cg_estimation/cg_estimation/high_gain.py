@@ -13,6 +13,10 @@ the sampled poles where these go in the time T since the last sample, z = exp(po
 
 so for T << eps it is T L, and it stays stable for every T and eps, across gaps too. With the gyro
 the rate of the inner leg is corrected by (1 - exp(-T/eps)) times its error as well.
+
+At the start nothing is known but the first readings, so eps grows to its value as a third of the
+time since then: the error then dies out as t^-2.5, about as in a fit of a line to all readings so
+far, where a fixed large eps would need several eps.
 """
 
 import cmath
@@ -25,6 +29,8 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import ModelEstimator
 
 FORMS = ('symmetric', 'printed')
+START = 0.005  # s, smallest eps at the start
+MEMORY = 3.0  # time since the start over eps while it grows
 
 
 def sampled_gain(pole: complex, epsilon: float, duration: float) -> tuple[float, float]:
@@ -73,6 +79,7 @@ class HighGainObserver(ModelEstimator):
         self._late = dict.fromkeys(self.channels, 0.0)
 
     def _correct(self, y: np.ndarray, duration: float) -> None:
+        epsilon = min(self.epsilon, max(START, self._now / MEMORY))
         error = y - self._readings()
         lean, rate, hip = (
             float(error[self._column[c]]) for c in ('imu_angle', 'imu_rate', 'hip_angle')
@@ -92,13 +99,13 @@ class HighGainObserver(ModelEstimator):
         )
         for leg, angle_error, time, told in legs:
             if told:
-                l1, l2 = sampled_gain(self._pole(leg), self.epsilon, time)
+                l1, l2 = sampled_gain(self._pole(leg), epsilon, time)
                 self._x[leg] += l1 * angle_error
                 self._x[2 + leg] += l2 * angle_error
         if self.use_gyro and spoke['imu_rate']:
             # The position's correction has moved the rate; what is left of its error counts.
             moved = self._x[2] - self._rate_before
-            weight = 1.0 - math.exp(-since['imu_rate'] / self.epsilon)
+            weight = 1.0 - math.exp(-since['imu_rate'] / epsilon)
             self._x[2] += weight * (rate - moved)
         self._late = {c: 0.0 if spoke[c] else since[c] for c in since}
         self._remember()

@@ -67,6 +67,15 @@ class SimulationSettings(Settings):
         minimum=0.1,
         maximum=600.0,
     )
+    await_answer: bool = setting(
+        False,
+        'real time: repeat the first measurement until a command answers it, and only then let '
+        'time run, as lock-step does; a robot that falls by itself needs its controller',
+    )
+    pushes: tuple[float, ...] = setting(
+        (),
+        'instants and horizontal impulses at the hip, in turn: t1, P1, t2, P2, ... [s, N s]',
+    )
     recorders: int = setting(
         0,
         'recorders that must have subscribed to every topic before the first sample, and '
@@ -86,6 +95,21 @@ class SimulationSettings(Settings):
     notes: str = setting('', 'free text for the recording note')
     autostart: bool = setting(True, 'configure and activate without being asked')
     exit_when_done: bool = setting(False, 'end the process after `duration` or a failure')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.pushes) % 2:
+            raise ValueError(
+                f'pushes has {len(self.pushes)} numbers; an instant and an impulse for each push'
+            )
+
+    def pushes_at(self, tick: int) -> float:
+        """Impulse in N s that hits the hip before that sample."""
+        return sum(
+            impulse
+            for instant, impulse in zip(self.pushes[::2], self.pushes[1::2], strict=True)
+            if round(instant * self.sample_rate_hz) == tick
+        )
 
 
 def model_file_of(path: str) -> Path:

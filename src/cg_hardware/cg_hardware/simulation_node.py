@@ -245,7 +245,8 @@ class SimulationNode(LifecycleNode):
         self.ticks = 0
         self.epoch_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
         self.pace = Pace(self.settings.sample_rate_hz, time.monotonic_ns())
-        if self.lockstep:
+        self._awaiting_first = self.settings.await_answer and not self.lockstep
+        if self.lockstep or self._awaiting_first:
             self._present()
 
     def _stamp(self) -> int:
@@ -254,6 +255,9 @@ class SimulationNode(LifecycleNode):
     def _publish_measurement(self) -> None:
         if self.clock_publisher is not None:
             self.clock_publisher.publish(Clock(clock=to_stamp(self._stamp())))
+        impulse = self.settings.pushes_at(self.ticks)
+        if impulse:
+            self.plant.push(impulse)
         self._measurement = self.plant.measure()
         self.sensors.publish_measurement(self._stamp(), self._measurement)
 
@@ -272,6 +276,10 @@ class SimulationNode(LifecycleNode):
     # Real time
 
     def _poll_real_time(self) -> float:
+        if self._awaiting_first:
+            now = time.monotonic()
+            self._repeat_first(now)
+            return self._repeat_at - now
         # One sample at a time, so that a late machine still hears the answers between samples.
         if self.pace.take(time.monotonic_ns()):
             if self.total is not None and self.ticks >= self.total:
@@ -304,6 +312,12 @@ class SimulationNode(LifecycleNode):
         stamp_ns = to_nanoseconds(message.header.stamp)
         if self.lockstep:
             self._answer(stamp_ns, request)
+            return
+        if self._awaiting_first:
+            # Somebody controls the machine; its time begins now.
+            self._awaiting_first = False
+            self.epoch_ns = time.time_ns()
+            self.pace = Pace(self.settings.sample_rate_hz, time.monotonic_ns())
             return
         judgement = self.gate.offer(request, stamp_ns or self._stamp())
         if judgement.doubt:
@@ -355,11 +369,15 @@ class SimulationNode(LifecycleNode):
         if self.phase == 'running' and self.lockstep and self._held_back:
             self._present_when_recorded()
 
-    def _poll_lockstep(self, now: float) -> float:
-        if self._awaiting and self.ticks == 0 and now > self._repeat_at:
-            # The controller may not have been matched yet when the first measurement went out.
+    def _repeat_first(self, now: float) -> None:
+        # The controller may not have been matched yet when the first measurement went out.
+        if now > self._repeat_at:
             self._repeat_at = now + REPEAT
             self.sensors.publish_measurement(self._stamp(), self._measurement)
+
+    def _poll_lockstep(self, now: float) -> float:
+        if self._awaiting and self.ticks == 0:
+            self._repeat_first(now)
         if now > self._deadline:
             waited = f'{self.settings.answer_timeout:g} s'
             if self._awaiting:

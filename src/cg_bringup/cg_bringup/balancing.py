@@ -1,0 +1,119 @@
+"""The balancing loop in lock-step, without ROS: the very classes that the nodes run.
+
+    machine -> estimator -> controller -> torque gate -> machine
+
+once per sample, as docs/interfaces.md ("Lock-step") says of the nodes. Benches and tests run this.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cg_control.balance import BALANCING, BalanceController
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.plant import Plant
+from cg_dynamics.rig import STANCES
+from cg_estimation.estimator import Estimator
+from cg_hardware.safety import GateSettings, TorqueGate
+
+FALLEN = 0.6  # rad of the stance leg: nothing catches the robot from there
+
+
+@dataclass(frozen=True)
+class BalanceRun:
+    """A run of the loop, one row per sample.
+
+    Attributes:
+        time: In s, shape (n,).
+        states: True states, shape (n, nx).
+        estimates: What the controller was told, shape (n, 4 or more).
+        torque: What the drive latched, N m, shape (n,).
+        readings: Channel -> what the sensors reported, shape (n,).
+        engaged: Whether the controller was balancing, shape (n,).
+        standing: Index of the stance leg.
+    """
+
+    time: np.ndarray
+    states: np.ndarray
+    estimates: np.ndarray
+    torque: np.ndarray
+    readings: dict[str, np.ndarray]
+    engaged: np.ndarray
+    standing: int
+
+    @property
+    def lean(self) -> np.ndarray:
+        """Lean of the stance leg in rad, shape (n,)."""
+        return self.states[:, self.standing]
+
+    def upright(self, duration: float) -> bool:
+        """True if the run lasted that many s, engaged to the end, and ends upright."""
+        tail = self.time > self.time[-1] - 0.5
+        return bool(
+            self.time[-1] > duration - 0.01
+            and self.engaged[tail].all()
+            and np.abs(self.lean[tail]).max() < 0.2
+        )
+
+
+def balance(
+    plant: Plant,
+    estimator: Estimator,
+    controller: BalanceController,
+    duration: float,
+    pushes: Sequence[tuple[float, float]] = (),
+) -> BalanceRun:
+    """Run the loop until time is over or the robot lies.
+
+    Args:
+        plant: The machine.
+        estimator: Told the readings and the torque that was latched.
+        controller: Told the estimate.
+        duration: In s.
+        pushes: Instants in s and horizontal impulses in N s at the hip.
+    """
+    stance = plant.setup.stance
+    standing = STANCES.index(stance)
+    gate = TorqueGate(GateSettings(torque_limit=controller.torque_limit), ('hip',))
+    rows: list[tuple] = []
+    torque = 0.0
+    hits = {round(instant * 1e9 / plant.sample_ns): impulse for instant, impulse in pushes}
+    for tick in range(round(duration * 1e9 / plant.sample_ns)):
+        if tick in hits:
+            plant.push(hits[tick])
+        measurement = plant.measure()
+        now = measurement.time_ns
+        estimate = estimator.step(now, torque, measurement.outputs, stance)
+        command = controller.step(now, estimate.stance, estimate.x)
+        gate.offer([command.torque], now)
+        (torque,) = gate.torque(now).torque
+        rows.append(
+            (now * 1e-9, plant.state, estimate.x, torque, measurement.outputs, controller.mode)
+        )
+        plant.latch(np.array([torque]))
+        try:
+            plant.advance()
+        except SimulationError:
+            break
+        if abs(plant.state[standing]) > FALLEN:
+            break
+    time, states, estimates, torques, readings, modes = zip(*rows, strict=True)
+    return BalanceRun(
+        np.array(time),
+        np.array(states),
+        np.array(estimates),
+        np.array(torques),
+        {c: np.array([r[c] for r in readings]) for c in readings[0]},
+        np.array([mode == BALANCING for mode in modes]),
+        standing,
+    )
+
+
+def power_above(torque: np.ndarray, sample_time: float, frequency: float) -> float:
+    """RMS in N m of the part of a torque above a frequency in Hz."""
+    if len(torque) < 2:
+        return 0.0
+    spectrum = np.abs(np.fft.rfft(torque - torque.mean())) ** 2
+    high = np.fft.rfftfreq(len(torque), sample_time) > frequency
+    return float(np.sqrt(2.0 * spectrum[high].sum()) / len(torque))

@@ -1,0 +1,291 @@
+"""ROS node of the balance controller: /state in, /torque_command out. The law is in balance.py.
+
+Every state is answered by the command of its stamp, zero torque included, so that the same node
+works in real time and in lock-step. The gains are made when the node starts, and anew when a scale
+is set; a setting without a regulator is refused, the gains stay as they were. While the basin of
+new gains is being sampled (in a process of its own) a controller that balances goes on, one that
+does not waits.
+
+It also watches the loop: the age of the measurement when the drive latched the torque that answers
+it, and how many deadlines of `deadline` were missed, on /diagnostics.
+"""
+
+import collections
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from cg_control.balance import (
+    BALANCING,
+    WEIGHTS,
+    BalanceController,
+    BalanceSettings,
+    balance_gains,
+)
+from cg_control.basin import Basin, modes_of, shipped_basins
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
+from cg_dynamics.settings import setting
+
+NOMINAL_MODEL = 'compass_gait_mit'
+GAP = 0.02  # s between states after which the one before is history
+ROTOR = 'hip_rotor'
+
+
+@dataclass(frozen=True)
+class BalanceNodeSettings(BalanceSettings):
+    """Parameters of the balance node."""
+
+    model_file: str = setting('', 'model file to design on; empty for the nominal compass gait')
+    elastic: bool = setting(
+        False, 'design on the transmission too; the observer must have the same model'
+    )
+    sample_rate_hz: float = setting(
+        500.0, 'rate of the states', unit='Hz', minimum=10.0, maximum=2000.0
+    )
+    deadline: float = setting(
+        0.004,
+        'age of a measurement at which the torque that answers it is late',
+        unit='s',
+        minimum=0.0001,
+        maximum=1.0,
+        live=True,
+    )
+
+
+class BalanceNode(Node):
+    """Publishes /torque_command."""
+
+    def __init__(self, **kwargs):
+        super().__init__('balance', **kwargs)
+        self.started = False
+        self.declared = DeclaredSettings(self, BalanceNodeSettings, at_work=lambda: self.started)
+        settings = self.declared.values
+        self.path = settings.model_file or str(model_path(NOMINAL_MODEL))
+        self.model = Model.load(self.path)
+        gains = self._gains(settings)
+        self.controller = BalanceController(self.model, settings, gains)
+        self._samplers: dict[str, subprocess.Popen] = {}
+        self._basins: dict[str, Basin] | None = None
+        self._adopted = settings
+        self._find_basins()
+        self.add_on_set_parameters_callback(self._judge)
+        self.message = JointState(name=['hip'])
+        self.message.header.frame_id = 'hip'
+        self._last_ns: int | None = None
+        self._reason = 'no state yet'
+        self._ages: collections.deque[float] = collections.deque(maxlen=5000)
+        self._answered: collections.OrderedDict[int, float] = collections.OrderedDict()
+        self._late = 0
+        self._next_diagnosis = 0.0
+        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
+        self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
+        self.started = True
+
+    def _gains(self, settings: BalanceNodeSettings) -> dict[str, np.ndarray]:
+        return balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz, settings.elastic)
+
+    # Parameters
+
+    def _judge(self, parameters: list) -> SetParametersResult:
+        """Refuse settings for which there is no regulator."""
+        names = {field.name for field in dataclasses.fields(self.declared.values)}
+        changes = {p.name: p.value for p in parameters if p.name in names}
+        if not changes.keys() & set(WEIGHTS):
+            return SetParametersResult(successful=True)
+        try:
+            self._gains(dataclasses.replace(self.declared.values, **changes))
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _adopt(self) -> None:
+        """Take over what `ros2 param set` has changed."""
+        settings, before = self.declared.values, self._adopted
+        if settings is before:
+            return
+        self._adopted = settings
+        changed = {
+            field.name
+            for field in dataclasses.fields(settings)
+            if getattr(settings, field.name) != getattr(before, field.name)
+        }
+        if changed & set(WEIGHTS):
+            self.controller.adopt(settings, self._gains(settings))
+        else:
+            self.controller.adopt(settings)
+        if changed & {*WEIGHTS, 'torque_limit'}:
+            self._find_basins()
+
+    # Basins
+
+    def _find_basins(self) -> None:
+        for sampler in self._samplers.values():
+            sampler.kill()
+            sampler.wait()
+        gains, limit = self.controller.gains, self.controller.torque_limit
+        self._samplers = {}
+        self._basins = shipped_basins(self.model, gains, limit)
+        self.controller.basins = self._basins
+        if self._basins is None:
+            self.get_logger().info('sampling the basin of these gains')
+            self._bounds: dict[str, tuple[float, ...]] = {}
+            self._samplers = {
+                stance: subprocess.Popen(
+                    [
+                        *('nice', '-n', '10', sys.executable, '-m', 'cg_control.basin'),
+                        *(self.path, stance, repr(limit), '--'),
+                        *(repr(float(k)) for k in gains[stance][:4]),
+                    ],
+                    stdout=subprocess.PIPE,
+                    stdin=subprocess.DEVNULL,
+                )
+                for stance in STANCES
+            }
+
+    def _collect_basins(self) -> None:
+        for stance, sampler in list(self._samplers.items()):
+            if sampler.poll() is None:
+                continue
+            del self._samplers[stance]
+            text = sampler.stdout.read()
+            if sampler.returncode != 0:
+                self.get_logger().error(f'the basin of the {stance} leg could not be sampled')
+                continue
+            self._bounds[stance] = tuple(json.loads(text))
+            if len(self._bounds) == len(STANCES):
+                self._basins = {
+                    s: Basin(modes_of(self.model, s), bounds) for s, bounds in self._bounds.items()
+                }
+                self.controller.basins = self._basins
+                self.get_logger().info(
+                    'basin sampled: '
+                    + ', '.join(f'{s} {b[0]:.3f} rad' for s, b in self._bounds.items())
+                )
+
+    # The loop
+
+    def on_state(self, message: JointState) -> None:
+        """Answer a state."""
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        if stamp_ns == self._last_ns:
+            self.publisher.publish(self.message)
+            return
+        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
+            self.controller.stop()
+        self._last_ns = stamp_ns
+        self._adopt()
+        stance = message.header.frame_id.removesuffix('_foot')
+        torque, self._reason = 0.0, ''
+        try:
+            x = self._state_of(message)
+            if stance not in STANCES:
+                raise ValueError(f'frame_id is {message.header.frame_id!r}; no foot of this robot')
+        except ValueError as error:
+            self.controller.stop()
+            self._reason = str(error)
+        else:
+            if self._basins is None and self.controller.mode != BALANCING:
+                self._reason = 'the basin of these gains is being sampled'
+            else:
+                command = self.controller.step(stamp_ns, stance, x)
+                torque, self._reason = command.torque, command.reason
+        self._send(stamp_ns, torque)
+
+    def _state_of(self, message: JointState) -> np.ndarray:
+        names = [*STANCES, *([ROTOR] if ROTOR in message.name else [])]
+        if len(message.position) != len(message.name) or len(message.velocity) != len(
+            message.name
+        ):
+            raise ValueError('state without as many positions and velocities as names')
+        try:
+            rows = [list(message.name).index(name) for name in names]
+        except ValueError:
+            raise ValueError(f'state of {list(message.name)}; expected {names}') from None
+        q = [message.position[row] for row in rows]
+        v = [message.velocity[row] for row in rows]
+        return np.array([*q[:2], *v[:2], *q[2:], *v[2:]])
+
+    def _send(self, stamp_ns: int, torque: float) -> None:
+        self.message.header.stamp = to_stamp(stamp_ns)
+        self.message.effort = [torque if math.isfinite(torque) else 0.0]
+        self.publisher.publish(self.message)
+        self._answered[stamp_ns] = self.message.effort[0]
+        while len(self._answered) > 20:
+            self._answered.popitem(last=False)
+
+    def on_applied(self, message: JointState) -> None:
+        """Note how old the measurement was when its torque was latched."""
+        if len(message.effort) != 1:
+            return
+        latched_ns, torque = to_nanoseconds(message.header.stamp), message.effort[0]
+        answers = [stamp for stamp, sent in self._answered.items() if sent == torque]
+        # Equal torques (zero, the limit) do not tell which of them was latched.
+        if len(answers) == 1 and answers[0] <= latched_ns:
+            age = (latched_ns - answers[0]) * 1e-9
+            self._ages.append(age)
+            self._late += age > self.declared.values.deadline
+
+    def poll(self) -> float:
+        """Look after the samplers, say once a second how it goes."""
+        now = time.monotonic()
+        if self._samplers:
+            self._collect_basins()
+        if now >= self._next_diagnosis:
+            self._next_diagnosis = now + 1.0
+            self._publish_diagnostics()
+        return 0.2
+
+    def _publish_diagnostics(self) -> None:
+        status = DiagnosticStatus(name='balance', hardware_id='torque path')
+        well = self.controller.mode == BALANCING and not self._late
+        status.level = DiagnosticStatus.OK if well else DiagnosticStatus.WARN
+        status.message = self.controller.mode + (f': {self._reason}' if self._reason else '')
+        values = {
+            'falls': self.controller.falls,
+            'missed_deadlines': self._late,
+            'deadline_ms': f'{1e3 * self.declared.values.deadline:.3f}',
+        }
+        if self._ages:
+            ages = 1e3 * np.array(self._ages)
+            values |= {
+                'age_p50_ms': f'{np.percentile(ages, 50):.3f}',
+                'age_p99_ms': f'{np.percentile(ages, 99):.3f}',
+                'age_max_ms': f'{ages.max():.3f}',
+            }
+        status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = to_stamp(time.time_ns())
+        self.diagnostics.publish(array)
+        self._late = 0
+
+    def close(self) -> None:
+        """Leave with zero torque, and no sampler behind."""
+        for sampler in self._samplers.values():
+            sampler.kill()
+            sampler.wait()
+        if self._last_ns is not None:
+            self._send(self._last_ns, 0.0)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_control balance_node`."""
+    return run(BalanceNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

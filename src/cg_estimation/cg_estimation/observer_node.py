@@ -1,0 +1,177 @@
+"""ROS node of the observer: sensors and applied torque in, /state out.
+
+The estimation is in high_gain.py and its rivals, the gathering of messages in samples.py. A state
+is published for every measurement, with its stamp, as long as both positions are fresh; a
+repeated measurement (lock-step) is answered by the same state.
+"""
+
+import math
+import time
+from dataclasses import dataclass
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import WrenchStamped
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, JointState
+
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
+from cg_dynamics.settings import setting
+from cg_estimation.estimator import Estimate
+from cg_estimation.observer_settings import ObserverSettings, make_estimator, tune
+from cg_estimation.samples import Gatherer
+
+NOMINAL_MODEL = 'compass_gait_mit'
+LOADED = 0.5  # N, or the 1 of a plain switch
+ROTOR = 'hip_rotor'
+REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
+
+
+@dataclass(frozen=True)
+class ObserverNodeSettings(ObserverSettings):
+    """Parameters of the observer node."""
+
+    stance: str = setting(
+        'contacts', 'the leg that stands, or that the foot contacts tell it',
+        choices=('contacts', *STANCES),
+    )  # fmt: skip
+
+
+class ObserverNode(Node):
+    """Publishes /state."""
+
+    def __init__(self, **kwargs):
+        super().__init__('observer', **kwargs)
+        self.started = False
+        self.declared = DeclaredSettings(self, ObserverNodeSettings, at_work=lambda: self.started)
+        settings = self.declared.values
+        path = settings.model_file or model_path(NOMINAL_MODEL)
+        told = settings.stance == 'contacts'
+        self.estimator = make_estimator(
+            settings, Model.load(path), Setup(stance='inner' if told else settings.stance)
+        )
+        self.gatherer = Gatherer(contacts=told)
+        rotor = len(self.estimator.state_names) == 6
+        self.message = JointState(name=[*STANCES, *([ROTOR] if rotor else [])])
+        self._order = [0, 1, 4] if rotor else [0, 1]
+        self._published = 0
+        self._withheld = 0
+        self._longest = 0.0
+        self._next_diagnosis = 0.0
+        self._last_ns = 0
+        self.publisher = self.create_publisher(JointState, '/state', SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        for kind, topic, heard in (
+            (JointState, '/applied_torque', self.on_torque),
+            (JointState, '/hip_encoder', self.on_encoder),
+            (WrenchStamped, '/foot_contact/inner', lambda m: self.on_contact('inner', m)),
+            (WrenchStamped, '/foot_contact/outer', lambda m: self.on_contact('outer', m)),
+            (Imu, '/imu', self.on_imu),
+        ):
+            self.create_subscription(kind, topic, heard, SENSOR_QOS)
+        self.started = True
+
+    def on_torque(self, message: JointState) -> None:
+        """The drive has latched a torque."""
+        if list(message.name) == ['hip'] and len(message.effort) == 1:
+            self.gatherer.add_torque(to_nanoseconds(message.header.stamp), message.effort[0])
+            self._use()
+
+    def on_encoder(self, message: JointState) -> None:
+        """Hip angle."""
+        if 'hip' in message.name and len(message.position) == len(message.name):
+            angle = message.position[message.name.index('hip')]
+            self._take(to_nanoseconds(message.header.stamp), {'hip_angle': angle})
+
+    def on_contact(self, leg: str, message: WrenchStamped) -> None:
+        """Foot contact."""
+        stamp = to_nanoseconds(message.header.stamp)
+        self.gatherer.add_contact(stamp, leg, message.wrench.force.z > LOADED)
+        self._use()
+
+    def on_imu(self, message: Imu) -> None:
+        """Lean of the inner legs, docs/interfaces.md, and its rate."""
+        outputs = {}
+        if message.orientation_covariance[0] != -1.0:
+            q = message.orientation
+            outputs['imu_angle'] = math.atan2(
+                2.0 * (q.w * q.y - q.x * q.z), 1.0 - 2.0 * (q.x**2 + q.y**2)
+            )
+        if message.angular_velocity_covariance[0] != -1.0:
+            outputs['imu_rate'] = message.angular_velocity.y
+        self._take(to_nanoseconds(message.header.stamp), outputs)
+
+    def _take(self, stamp_ns: int, outputs: dict[str, float]) -> None:
+        if stamp_ns < self._last_ns - REPEATED_START:
+            self.gatherer.restart()
+            self.estimator.reset()
+            self._last_ns = 0
+        if stamp_ns == self._last_ns and 'imu_angle' in outputs:
+            self.publisher.publish(self.message)
+            return
+        self.gatherer.add(stamp_ns, outputs)
+        self._use()
+
+    def _use(self) -> None:
+        for measurement in self.gatherer.due():
+            start = time.perf_counter()
+            settings = self.declared.values
+            tune(self.estimator, settings)
+            estimate = self.estimator.step(
+                measurement.stamp_ns, measurement.torque, measurement.outputs, measurement.stance
+            )
+            self._publish(estimate, settings.longest_blind)
+            self._last_ns = measurement.stamp_ns
+            self._longest = max(self._longest, time.perf_counter() - start)
+
+    def _publish(self, estimate: Estimate, longest_blind: float) -> None:
+        if not estimate.blind <= longest_blind:
+            self._withheld += 1
+            self.get_logger().warning(
+                f'no position for {estimate.blind:.3g} s; no state is published',
+                throttle_duration_sec=1.0,
+            )
+            return
+        x = estimate.x
+        self.message.header.stamp = to_stamp(estimate.stamp_ns)
+        self.message.header.frame_id = f'{estimate.stance}_foot'
+        self.message.position = [float(x[i]) for i in self._order]
+        rates = [2, 3, 5] if len(self._order) == 3 else [2, 3]
+        self.message.velocity = [float(x[i]) for i in rates]
+        self.publisher.publish(self.message)
+        self._published += 1
+
+    def poll(self) -> float:
+        """Say once a second how it goes."""
+        now = time.monotonic()
+        if now >= self._next_diagnosis:
+            self._next_diagnosis = now + 1.0
+            status = DiagnosticStatus(name='observer', hardware_id='state')
+            ill = self._withheld or self.estimator.restarts
+            status.level = DiagnosticStatus.WARN if ill else DiagnosticStatus.OK
+            status.message = 'observing' if self._published else 'no measurements'
+            counts = {
+                'published': self._published,
+                'withheld': self._withheld,
+                'restarts': self.estimator.restarts,
+                'samples_out_of_order': self.estimator.ignored,
+                'longest_step_ms': f'{1e3 * self._longest:.3f}',
+            }
+            status.values = [KeyValue(key=k, value=str(v)) for k, v in counts.items()]
+            array = DiagnosticArray(status=[status])
+            array.header.stamp = to_stamp(time.time_ns())
+            self.diagnostics.publish(array)
+            self._published = self._withheld = self.estimator.restarts = 0
+            self._longest = 0.0
+        return max(0.0, self._next_diagnosis - now)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_estimation observer_node`."""
+    return run(ObserverNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,117 @@
+"""Messages of one instant come on several topics; here they become one measurement. No ROS.
+
+A measurement is whole when its IMU, encoder and (if they speak at all) foot contacts are there,
+and the torque that the drive held since the one before is known. Whole ones are given out at
+once and in order. One that stays in parts is given out as it is once PATIENCE newer IMU samples
+have come: in lock-step, where nothing moves on without an answer, that never happens.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+PATIENCE = 2
+KEPT = 64  # measurements in parts; more than that are of a clock that jumped
+
+
+@dataclass
+class Sample:
+    """A measurement as it comes together.
+
+    Attributes:
+        stamp_ns: Its instant, ns.
+        outputs: Channel -> reading.
+        contact: Leg -> whether it is loaded.
+    """
+
+    stamp_ns: int
+    outputs: dict[str, float] = field(default_factory=dict)
+    contact: dict[str, bool] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What an estimator is told.
+
+    Attributes:
+        stamp_ns: Its instant, ns.
+        torque: Held since the one before, N m.
+        outputs: Channel -> reading, those that came.
+        stance: Leg that stands; None where the contacts do not tell.
+    """
+
+    stamp_ns: int
+    torque: float
+    outputs: dict[str, float]
+    stance: str | None
+
+
+class Gatherer:
+    """Puts the parts together.
+
+    Args:
+        contacts: Whether the foot contacts tell the stance leg.
+    """
+
+    def __init__(self, contacts: bool = True):
+        self.contacts = contacts
+        self._waiting: dict[int, Sample] = {}
+        self._last_ns: int | None = None
+        self._torque, self._torque_ns = 0.0, -1
+        self._speak: set[str] = set()
+
+    def add(self, stamp_ns: int, outputs: dict[str, float]) -> None:
+        """Readings of one instant."""
+        sample = self._at(stamp_ns)
+        if sample is not None:
+            sample.outputs |= outputs
+
+    def add_contact(self, stamp_ns: int, leg: str, loaded: bool) -> None:
+        """A foot contact."""
+        self._speak.add(leg)
+        sample = self._at(stamp_ns)
+        if sample is not None:
+            sample.contact[leg] = loaded
+
+    def add_torque(self, stamp_ns: int, torque: float) -> None:
+        """The torque that the drive latched at that instant, N m."""
+        if stamp_ns > self._torque_ns:
+            self._torque, self._torque_ns = torque, stamp_ns
+
+    def restart(self) -> None:
+        """The clock has jumped back: forget what was."""
+        self._waiting.clear()
+        self._last_ns, self._torque, self._torque_ns = None, 0.0, -1
+
+    def due(self) -> Iterator[Measurement]:
+        """The measurements that may be used now, in order."""
+        while self._waiting:
+            stamp_ns = min(self._waiting)
+            sample = self._waiting[stamp_ns]
+            newer = sum('imu_angle' in other.outputs for other in self._waiting.values()) - (
+                'imu_angle' in sample.outputs
+            )
+            if not self._whole(sample) and newer < PATIENCE:
+                return
+            del self._waiting[stamp_ns]
+            self._last_ns = stamp_ns
+            if sample.outputs:
+                yield Measurement(stamp_ns, self._torque, sample.outputs, self._stance(sample))
+
+    def _at(self, stamp_ns: int) -> Sample | None:
+        if self._last_ns is not None and stamp_ns <= self._last_ns:
+            return None
+        if len(self._waiting) >= KEPT:
+            del self._waiting[min(self._waiting)]
+        return self._waiting.setdefault(stamp_ns, Sample(stamp_ns))
+
+    def _whole(self, sample: Sample) -> bool:
+        known = self._last_ns is None or self._torque_ns < 0 or self._torque_ns >= self._last_ns
+        return (
+            known
+            and {'imu_angle', 'hip_angle'} <= sample.outputs.keys()
+            and (not self.contacts or self._speak <= sample.contact.keys())
+        )
+
+    def _stance(self, sample: Sample) -> str | None:
+        loaded = [leg for leg, pressed in sample.contact.items() if pressed]
+        return loaded[0] if self.contacts and len(loaded) == 1 else None
