@@ -46,6 +46,10 @@ class TvlqrNodeSettings(ExecutionSettings):
     sample_rate_hz: float = setting(
         500.0, 'rate of the states', unit='Hz', minimum=10.0, maximum=2000.0
     )
+    start_after: float = setting(
+        0.0, 'start the selected trajectory unasked, once, after balancing for so long; 0: never',
+        unit='s', minimum=0.0, live=True,
+    )  # fmt: skip
 
 
 class TvlqrNode(Node):
@@ -66,6 +70,8 @@ class TvlqrNode(Node):
         self._last_ns: int | None = None
         self._reason = 'no state yet'
         self._next_diagnosis = 0.0
+        self._balancing_since: int | None = None
+        self._started_unasked = False
         self.message = JointState(name=['hip'])
         self.message.header.frame_id = 'hip'
         self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
@@ -91,11 +97,27 @@ class TvlqrNode(Node):
         if not message.points:
             self.controller.stop()
             return
+        self._start()
+
+    def _start(self) -> None:
         problem = self.problem
         if self.trajectory is not None:
             problem = self.controller.start(self.trajectory)
         if problem:
             self.get_logger().error(f'trajectory not started: {problem}')
+
+    def _start_unasked(self, stamp_ns: int) -> None:
+        after = self.declared.values.start_after
+        if after == 0.0 or self._started_unasked or self.trajectory is None:
+            return
+        if self.controller.mode != BALANCING:
+            self._balancing_since = None
+            return
+        if self._balancing_since is None:
+            self._balancing_since = stamp_ns
+        if stamp_ns - self._balancing_since >= after * 1e9:
+            self._started_unasked = True
+            self._start()
 
     def on_state(self, message: JointState) -> None:
         """Answer a state."""
@@ -119,6 +141,7 @@ class TvlqrNode(Node):
         command = self.controller.step(stamp_ns, stance, x)
         self._reason = command.reason
         self._send(stamp_ns, command.torque)
+        self._start_unasked(stamp_ns)
 
     def _send(self, stamp_ns: int, torque: float) -> None:
         self.message.header.stamp = to_stamp(stamp_ns)
