@@ -239,6 +239,7 @@ class Guess:
 
 
 GUESSES = (Guess(0.15, 0.9), Guess(0.25, 0.6), Guess(0.2, 1.4), Guess(0.35, 0.45))
+SMALLEST_LIMIT = 0.01  # N m
 SOFT_TRANSITION = 0.2  # rad/s
 WEAK = 1e-4  # weight of the running cost in the elastic program
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
@@ -301,7 +302,8 @@ class Program:
         self.task, self.intervals = task, intervals
         self.transcription: Transcription = transcribe(model, task.structure(intervals, elastic))
         limit = model.torque_limit if task.torque_limit is None else task.torque_limit
-        self.limit = min(limit, 1e4)
+        # Interior-point methods want room: what is next to nothing is nothing.
+        self.limit = min(limit, 1e4) if limit > SMALLEST_LIMIT else 0.0
         # The running cost makes the elastic motion unique and must not compete with its misses.
         weak = WEAK if elastic else 1.0
         self.p = np.concatenate([
@@ -344,9 +346,7 @@ class Program:
             if (i, k) == last and isinstance(task.goal, Box) and not elastic:
                 low, high = np.maximum(low, task.goal.lower), np.minimum(high, task.goal.upper)
             lower[at : at + 4], upper[at : at + 4] = low, high
-            # A torque that must be zero is a point; a width of rounding keeps it an interval.
-            room = max(self.limit, 1e-9)
-            lower[at + 6], upper[at + 6] = -room, room
+            lower[at + 6], upper[at + 6] = -self.limit, self.limit
             if k == 0:
                 lower[at + 7], upper[at + 7] = task.durations
         return lower, upper

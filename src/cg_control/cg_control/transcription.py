@@ -40,6 +40,9 @@ log = logging.getLogger(__name__)
 
 KNOT = 7  # q (2), v (2), a (2), u
 TORQUE_SCALE = 10.0  # N m; brings (ID) to the size of the other rows
+# Pivot tolerance of fatrop. The rows of a periodic motion are so nearly dependent that with its
+# own 1e-5 it regularises without end; ordinary rows are lost at 1e-3.
+PIVOT = {False: 1e-5, True: 1e-3}
 RATE_SCALE = 100.0  # N m/s
 CLEARANCE_WIDTH = 0.01  # m of reach over which a retracted foot comes down
 TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
@@ -451,7 +454,10 @@ class Transcription:
                     'print_time': False, 'structure_detection': 'manual',
                     'N': len(self._nx) - 1, 'nx': self._nx, 'nu': self._nu, 'ng': self._ng,
                     'equality': equality, 'error_on_fail': False,
-                    'fatrop': {'print_level': 0, 'max_iter': iterations, 'tol': tolerance},
+                    'fatrop': {
+                        'print_level': 0, 'max_iter': iterations, 'tol': tolerance,
+                        'linsol_lu_fact_tol': PIVOT[self.structure.periodic],
+                    },
                 },
             )  # fmt: skip
         return self._solvers[key]

@@ -14,7 +14,9 @@ from cg_control.collocation import (
     planning_model,
     screen,
 )
+from cg_dynamics.gait import find_gait
 from cg_dynamics.hybrid import WalkOptions, walk
+from cg_dynamics.impact import impact
 
 REBALANCE = Task(('inner', 'outer'), reach=0.2)
 
@@ -140,3 +142,40 @@ def test_plan_names_its_model(robot):
     trajectory = optimise(robot, REBALANCE)
     assert trajectory.model_hash == robot.hash
     assert trajectory.provenance['friction'] == 'planned'
+
+
+# The classic passive walker: two point-mass legs of 5 kg at half of 1 m, 10 kg at the hip.
+CLASSIC = {
+    'leg_length': 1.0, 'total_mass': 20.0, 'gravity': 9.81, 'c1': 0.0625 + 1e-7,
+    'c2': 0.0625 + 1e-7, 'c3': 1e-7, 'c4': 0.125, 'c5': 0.125, 'c6': 0.0,
+}  # fmt: skip
+
+
+def test_passive_gait_is_that_of_the_hybrid_simulation(robot):
+    """Found by collocation and by Newton's method on the walk itself, on 3 degrees."""
+    slope = 0.0525
+    walker = planning_model(robot, False).with_values(CLASSIC)
+    anywhere = Box.anywhere()
+    task = Task(
+        ('inner',), anywhere, anywhere, periodic=True, torque_limit=0.0, slope=slope,
+        durations=(0.2, 1.5), reach=0.2,
+    )  # fmt: skip
+    found = optimise(walker, task)
+    assert np.abs(found.torque).max() < 1e-9
+    x0 = found.states[0]
+    guess = [(x0[1] - x0[0]) / 2, x0[2], x0[3]]
+    gait = find_gait(walker, 'inner', guess, WalkOptions(slope=slope), steps=1)
+    # What Hermite-Simpson errs with 20 intervals.
+    np.testing.assert_allclose(gait.x0, x0, atol=2e-4)
+    assert gait.period == pytest.approx(found.duration, abs=2e-4)
+
+
+def test_gait_on_flat_ground_repeats_itself(robot):
+    walker = planning_model(robot, False).with_values(CLASSIC)
+    anywhere = Box.anywhere()
+    task = Task(('inner',), anywhere, anywhere, periodic=True, reach=0.4, durations=(0.2, 1.5))
+    found = optimise(walker, task)
+    done = played(found, walker)
+    assert len(done.impacts) <= 1
+    after = impact(walker, 'inner', found.states[-1]).x_plus
+    np.testing.assert_allclose(after[[1, 0, 3, 2]], found.states[0], atol=1e-5)
