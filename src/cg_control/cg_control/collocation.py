@@ -225,7 +225,7 @@ class Options:
     fine: int = 20
     guesses: int = 3
     coarse_iterations: int = 30
-    fine_iterations: int = 200
+    fine_iterations: int = 100
     tolerance: float = 1e-6
     seconds: float = 10.0
 
@@ -553,14 +553,18 @@ def optimise(
             coarse.seconds,
         )
     fine = Program(planned, task, options.fine)
-    found = fine.solve(
-        coarse.best.resampled(options.fine), options.fine_iterations, options.tolerance
-    )
+    spent = coarse.seconds
+    starts = [coarse.best.resampled(options.fine), *map(fine.guess, GUESSES[: options.guesses])]
+    for start in starts:
+        found = fine.solve(start, options.fine_iterations, options.tolerance)
+        spent += found.seconds
+        if found.converged or spent > options.seconds:
+            break
     if not found.converged:
         raise UndecidedError(
             f'a coarse motion {what} exists, but {options.fine} intervals a phase do not '
             f'converge within {options.fine_iterations} iterations',
-            coarse.seconds + found.seconds,
+            spent,
         )
     return found.trajectory(
         task.modes,
@@ -572,7 +576,7 @@ def optimise(
         intervals=options.fine,
         periodic=task.periodic,
         slope=task.slope,
-        seconds=round(coarse.seconds + found.seconds, 4),
+        seconds=round(spent, 4),
     )
 
 
