@@ -418,7 +418,8 @@ class Program:
     def solve(self, start: Solution, iterations: int, tolerance: float) -> Solution:
         """Solve from a start on the same grid."""
         began = time.perf_counter()
-        solver = self.transcription.solver(iterations, tolerance)
+        points = (self.x_lower == self.x_upper).tobytes()
+        solver = self.transcription.solver(iterations, tolerance, points)
         result = solver(
             x0=self._packed(start), lbx=self.x_lower, ubx=self.x_upper,
             lbg=self.lower, ubg=self.upper, p=self.p,

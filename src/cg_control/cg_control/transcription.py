@@ -443,9 +443,16 @@ class Transcription:
             generator.add(function)
         return str(shared_library(generator.dump(), FLAGS_HERE))
 
-    def solver(self, iterations: int, tolerance: float) -> ca.Function:
-        """Fatrop on the compiled program."""
-        key = (iterations, tolerance)
+    def solver(self, iterations: int, tolerance: float, points: bytes = b'') -> ca.Function:
+        """Fatrop on the compiled program.
+
+        Args:
+            iterations: At most.
+            tolerance: Of rows and optimality.
+            points: Which variables have equal bounds. The interface takes note of them at the
+                first call and never again, so that each pattern needs a solver of its own.
+        """
+        key = (iterations, tolerance, points)
         if key not in self._solvers:
             equality = (self.lower == self.upper).tolist()
             self._solvers[key] = ca.nlpsol(
@@ -463,7 +470,7 @@ class Transcription:
         return self._solvers[key]
 
     @functools.cached_property
-    def _solvers(self) -> dict[tuple[int, float], ca.Function]:
+    def _solvers(self) -> dict[tuple[int, float, bytes], ca.Function]:
         return {}
 
 
