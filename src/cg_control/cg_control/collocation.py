@@ -214,7 +214,8 @@ class Options:
     Attributes:
         coarse: Intervals a phase of the first solve.
         fine: Intervals a phase of the second.
-        guesses: From how many guesses the coarse solve starts; the cheapest motion is refined.
+        guesses: From how many guesses the coarse solve starts, more where those find nothing; the
+            cheapest motion is refined.
         coarse_iterations: Of one coarse solve.
         fine_iterations: Of the fine solve.
         tolerance: Of constraints and optimality, in the units of the scaled rows.
@@ -224,7 +225,7 @@ class Options:
     coarse: int = 8
     fine: int = 20
     guesses: int = 3
-    coarse_iterations: int = 30
+    coarse_iterations: int = 25
     fine_iterations: int = 100
     tolerance: float = 1e-6
     seconds: float = 10.0
@@ -245,7 +246,7 @@ WEAK = 1e-4  # weight of the running cost in the elastic program
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 BALLISTIC = 0.2  # s
 ELASTIC_ITERATIONS = 60
-WITNESSES = 2  # guesses that must end in a miss before a task counts as infeasible
+FAR = 1.0  # a miss by so much is believed at once; a nearer one must be left by every guess
 
 
 @dataclass(frozen=True)
@@ -489,34 +490,26 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
     elastic: Program | None = None
     best: Solution | None = None
     misses: list[float] = []
-    undecided = False
-    for guess in GUESSES[: options.guesses]:
+    for number, guess in enumerate(GUESSES):
+        if best is not None and number >= options.guesses:
+            break
         if time.perf_counter() - began > options.seconds:
-            undecided = True
             break
         found = strict.solve(strict.guess(guess), options.coarse_iterations, options.tolerance)
         if not found.converged and best is None:
             elastic = elastic or Program(model, task, options.coarse, elastic=True)
-            # Either a fresh view of the task or what the strict solve left of it.
-            start = found if misses else elastic.ballistic(guess)
+            start = elastic.guess(guess) if number % 2 else elastic.ballistic(guess)
             near = elastic.solve(start, ELASTIC_ITERATIONS, options.tolerance)
             miss = math.sqrt(max(near.cost - WEAK * elastic.running_cost(near), 0.0))
-            if not near.converged:
-                undecided = True
-            elif miss > MISSED:
+            if near.converged and miss > MISSED:
                 misses.append(miss)
-                if len(misses) == WITNESSES:
+                if miss > FAR and not task.periodic:
                     break
-            else:
+            elif near.converged:
                 found = strict.solve(near, options.coarse_iterations, options.tolerance)
-                undecided = undecided or not found.converged
         if found.converged and (best is None or found.cost < best.cost):
             best = found
-    verdict = 'undecided'
-    if best is not None:
-        verdict = 'feasible'
-    elif len(misses) == WITNESSES or (misses and not undecided):
-        verdict = 'infeasible'
+    verdict = 'feasible' if best is not None else 'infeasible' if misses else 'undecided'
     miss = 0.0 if best else min(misses, default=math.inf)
     return Screening(verdict, best, miss, time.perf_counter() - began)
 
