@@ -15,6 +15,7 @@ than 10 cm do not land: the robot stands on blocks. Every column sees the same s
 import argparse
 import platform
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -39,6 +40,9 @@ LUMPS = ('c1', 'c2', 'c3', 'c4', 'c5', 'c6')
 FRICTION = ('viscous_friction.coefficient', 'coulomb_friction.torque')
 ERRORS = (0.0, 0.05, 0.10)
 SLOPES = (-0.045, -0.03, -0.015, 0.015, 0.03, 0.045)
+OPTIONS = WalkOptions(
+    sample_time=SAMPLE_TIME, step=0.002, minimum_step=0.1, fall_angle=0.6, largest_steps=2
+)
 RESULT = Path(__file__).parent / 'results' / 'rebalance.md'
 
 
@@ -70,10 +74,7 @@ def planned(known: Model) -> tuple[Trajectory, np.ndarray]:
 
 
 def stands(trajectory, balance, known, robot, remedy: str, x0, slope: float = 0.0) -> bool:
-    options = WalkOptions(
-        sample_time=SAMPLE_TIME, step=0.002, minimum_step=0.1, fall_angle=0.6, slope=slope,
-        largest_steps=2,
-    )  # fmt: skip
+    options = replace(OPTIONS, slope=slope)
     try:
         done = executed(
             trajectory, robot, TrackingSettings(remedy=remedy), known, x0, MORE, options, balance
