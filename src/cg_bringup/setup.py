@@ -42,6 +42,7 @@ setup(
     entry_points={
         'console_scripts': [
             'balance = cg_bringup.balance_run:main',
+            'rebalance = cg_bringup.rebalance_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
             'replay = cg_bringup.replay:main',

@@ -31,6 +31,7 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
+        'matplotlib',
         'numpy',
         'scipy',
         'PyYAML',
@@ -40,6 +41,10 @@ setup(
     entry_points={
         'console_scripts': [
             'balance_node = cg_control.balance_node:main',
+            'cost_tuning = cg_control.cost_tuning:main',
+            'playback_node = cg_control.playback_node:main',
+            'trajectory_server_node = cg_control.trajectory_server_node:main',
+            'tvlqr_node = cg_control.tvlqr_node:main',
         ],
     },
 )

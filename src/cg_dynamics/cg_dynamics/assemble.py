@@ -31,6 +31,7 @@ class Equations:
         input_delay: Delay of the inputs in s.
         output_delays: Delay of each output in s, shape (ny, 1).
         mass_matrix: Of the free coordinates.
+        load: Generalised forces less bias, so that mass_matrix times acceleration is load: (m, 1).
         energy: Kinetic plus potential energy of bodies and springs in J.
         state_names: Names of x.
         parameter_names: Full names of p.
@@ -49,6 +50,7 @@ class Equations:
     input_delay: ca.SX
     output_delays: ca.SX
     mass_matrix: ca.SX
+    load: ca.SX
     energy: ca.SX
     state_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
@@ -166,7 +168,8 @@ def assemble(model: Model, setup: Setup) -> Equations:
     full = [ca.mtimes(kinematics.basis, s), ca.mtimes(kinematics.basis, ds)]
     kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
     mass_matrix, bias = manipulator(kinetic, potential, s, ds)
-    acceleration = solve_small(mass_matrix, ca.mtimes(kinematics.basis.T, force) - bias)
+    load = ca.mtimes(kinematics.basis.T, force) - bias
+    acceleration = solve_small(mass_matrix, load)
 
     # Sensors.
     outputs = mechanism.sensors(*full)
@@ -197,6 +200,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
         input_delay=input_delay,
         output_delays=ca.vertcat(*output_delays.values()),
         mass_matrix=mass_matrix,
+        load=load,
         energy=kinetic + potential,
         state_names=(
             *kinematics.names,

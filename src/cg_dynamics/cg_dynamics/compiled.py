@@ -367,16 +367,27 @@ def _delay_column(row: np.ndarray, column: np.ndarray) -> int:
 
 def _build(model: Model, setup: Setup, free: tuple[str, ...]) -> CompiledModel:
     equations = assemble(model, setup)
-    gcc = compiler()
-    if gcc is None:
+    if compiler() is None:
         log.warning('no C compiler found: models run on the CasADi virtual machine, slower')
         return CompiledModel(equations, free, None)
-    source = _source(equations, free)
-    key = '\n'.join([source, *FLAGS, gcc, platform.machine(), _cpu()])
+    return CompiledModel(equations, free, shared_library(_source(equations, free)))
+
+
+def shared_library(source: str, flags: tuple[str, ...] = FLAGS) -> Path:
+    """Compiled C source, from the cache if it was compiled before on this kind of machine.
+
+    Args:
+        source: The C source; math.h is linked.
+        flags: Of the compiler.
+    """
+    gcc = compiler()
+    if gcc is None:
+        raise RuntimeError('no C compiler found (cc, gcc, clang)')
+    key = '\n'.join([source, *flags, gcc, platform.machine(), _cpu()])
     target = cache_directory() / f'{hashlib.sha256(key.encode()).hexdigest()[:32]}.so'
     if not target.exists():
-        _compile(source, target, gcc)
-    return CompiledModel(equations, free, target)
+        _compile(source, target, gcc, flags)
+    return target
 
 
 @functools.cache

@@ -2,19 +2,24 @@
 
 It stands where the hardware would stand. Unlike the rollouts of identification it integrates at a
 tenth of a millisecond or less, lets a delayed torque act at its exact instant, and reports what
-sensors report: noisy, late, in counts.
+sensors report: noisy, late, in counts. A compass gait that is not on blocks walks: its swing foot
+lands (hybrid.py, (GUARD)), and the leg that stands changes.
 """
 
 import bisect
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import brentq
 
 from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import SimulationError
+from cg_dynamics.hybrid import INSTANT, swing_foot
+from cg_dynamics.impact import impact, other
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -52,6 +57,10 @@ class Plant:
             states of effects settle by themselves. None: all zero.
         sample_time: Time from one measurement to the next in s.
         seed: Of the sensor noise.
+        minimum_step: Not on blocks: the swing foot lands only this far ahead, m.
+
+    Attributes:
+        stance: The leg pair that stands now.
     """
 
     def __init__(
@@ -61,8 +70,13 @@ class Plant:
         initial_state: np.ndarray | None = None,
         sample_time: float = 0.002,
         seed: int = 0,
+        minimum_step: float = 0.1,
     ):
-        self.model, self.setup = model, setup
+        self.model, self.setup, self.stance = model, setup, setup.stance
+        self._minimum_step = minimum_step
+        self._walks = isinstance(model.mechanism, CompassGait) and not (
+            setup.on_blocks or setup.springs or setup.fixture != 'none'
+        )
         self.sample_ns = round(sample_time * 1e9)
         self._compiled = compile_model(model, setup)
         self._p = parameter_vector(model, setup)
@@ -126,7 +140,7 @@ class Plant:
         for index, (begin, stop) in enumerate(itertools.pairwise(edges)):
             u = stamped(self._latches[first + index][1], self._compiled.input_names, start)
             steps = max(1, int(np.ceil((stop - begin) / self._fine - 1e-9)))
-            self._compiled.advance(self._x, u, self._p, (stop - begin) / steps, steps)
+            self._move(u, (stop - begin) / steps, steps)
         self._latches = self._latches[first:]
         self._tick += 1
         if not np.isfinite(self._x).all() or np.abs(self._x).max() > 1e4:
@@ -136,6 +150,32 @@ class Plant:
         while len(self._past) > 2 and self._past[1][0] <= oldest:
             self._past.pop(0)
 
+    def _move(self, u: np.ndarray, step: float, steps: int) -> None:
+        before = self._x.copy()
+        self._compiled.advance(self._x, u, self._p, step, steps)
+        if not self._walks or not self._height(before) > 0 >= self._height(self._x):
+            return
+        duration = step * steps
+
+        def after(part: float) -> np.ndarray:
+            x = before.copy()
+            self._compiled.advance(x, u, self._p, part / steps, steps)
+            return x
+
+        instant = brentq(lambda part: self._height(after(part)), 0.0, duration, xtol=INSTANT)
+        x = after(instant)
+        reach, _ = swing_foot(x, self.stance, self.model.values['leg_length'])
+        if reach <= self._minimum_step:
+            return
+        landed = impact(self.model, self.stance, x)
+        self.stance, self._x = landed.stance, landed.x_plus
+        self._compiled = compile_model(self.model, replace(self.setup, stance=self.stance))
+        self._jolt = None
+        self._compiled.advance(self._x, u, self._p, (duration - instant) / steps, steps)
+
+    def _height(self, x: np.ndarray) -> float:
+        return swing_foot(x, self.stance, self.model.values['leg_length'])[1]
+
     def push(self, impulse: float) -> None:
         """Somebody hits the hip of a compass gait: the rates jump by M^-1 J' P at once.
 
@@ -143,7 +183,7 @@ class Plant:
             impulse: Horizontal impulse P in N s, positive forward.
         """
         if self._jolt is None:
-            e, stance = self._compiled.equations, self.setup.stance
+            e, stance = self._compiled.equations, self.stance
             m = e.coordinates
             q = e.x[:m]
             lean = q[self.model.mechanism.bodies.index(stance)]
@@ -210,5 +250,4 @@ class Plant:
             return {}
         weight = self.model.values['total_mass'] * self.model.values['gravity']
         # A switch, not a force plate: the stance foot carries the weight, dynamics left out.
-        other = 'outer' if self.setup.stance == 'inner' else 'inner'
-        return {self.setup.stance: weight, other: 0.0}
+        return {self.stance: weight, other(self.stance): 0.0}

@@ -83,6 +83,9 @@ class SimulationSettings(Settings):
         minimum=0,
         maximum=10,
     )
+    minimum_step: float = setting(
+        0.1, 'set-up with on_blocks false: least step that lands', unit='m', minimum=0.0
+    )
     experiment: str = setting('', 'name of the experiment, for the recording note')
     note_model_file: str = setting(
         '',
@@ -145,6 +148,7 @@ def build_plant(settings: SimulationSettings, model: Model, setup: Setup) -> Pla
         initial_state=state,
         sample_time=1.0 / settings.sample_rate_hz,
         seed=settings.seed,
+        minimum_step=settings.minimum_step,
     )
 
 

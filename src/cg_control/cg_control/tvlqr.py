@@ -1,0 +1,271 @@
+"""Time-varying linear-quadratic regulation along a hybrid trajectory (the seed's 4.5).
+
+    min int (x'Q x + u'R u) dt + x(T)'Q_f x(T),   dx/dt = A(t) x + B(t) u  (deviations)
+    -dS/dt = Q + S A + A'S - S B R^-1 B'S,  S(T) = Q_f,   u = u0 - K (x - x0),  K = R^-1 B'S  (RIC)
+
+(RIC) is solved exactly in S: with S = Y X^-1 it is linear, d(X, Y)/dt = H(t) (X, Y), and
+
+    H = [A, -B R^-1 B'; -Q, -A'],   (X, Y)(t) = exp(-Omega) (X, Y)(t + h)
+    Omega = h/2 (H1 + H2) - sqrt(3) h^2/12 [H1, H2]                               (MAG4)
+
+is Magnus' fourth order from the two Gauss points of each interval. At an impact a deviation jumps
+by the saltation matrix, which counts that a deviating robot lands at another time: with the
+impact map Delta, its derivative D, the guard's gradient n and rates f before and after,
+
+    Xi = D + (f+ - D f-) n' / (n'f-),   S- = Xi' S+ Xi                            (SALT)
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from cg_control.balance import BalanceSettings
+from cg_control.linearise import design_model, linearise_stance
+from cg_control.lqr import Regulator, lqr
+from cg_control.trajectory import Phase, Trajectory, TrajectoryError
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import CompiledModel, compile_model
+from cg_dynamics.hybrid import STANCES
+from cg_dynamics.impact import impact_function
+from cg_dynamics.linearise import jacobians
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+
+GAUSS = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Costs of deviations, by the role of a leg: they change places with the stance leg.
+
+    The defaults are, rounded, those of the balance controller.
+
+    Attributes:
+        stance_angle: 1/rad^2. The highest, says the seed: it decides who still stands.
+        swing_angle: 1/rad^2. The second.
+        stance_rate: s^2/rad^2. Far below.
+        swing_rate: s^2/rad^2. Far below.
+        torque: 1/(N m)^2.
+        final: Final cost, as a multiple of the balance controller's cost to go.
+    """
+
+    stance_angle: float = 178.0
+    swing_angle: float = 11.0
+    stance_rate: float = 69.0
+    swing_rate: float = 0.016
+    torque: float = 1 / 1600
+    final: float = 1.0
+
+    def __post_init__(self):
+        for name in ('stance_angle', 'swing_angle', 'stance_rate', 'swing_rate'):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f'{name} is {getattr(self, name)}; it must not be negative')
+        for name in ('torque', 'final'):
+            if not getattr(self, name) > 0:
+                raise ValueError(f'{name} is {getattr(self, name)}; it must be positive')
+
+    def Q(self, stance: str) -> np.ndarray:
+        """Weight of (q_inner, q_outer) and rates while that leg stands, shape (4, 4)."""
+        roles = [self.stance_angle, self.swing_angle, self.stance_rate, self.swing_rate]
+        order = [0, 1, 2, 3] if stance == 'inner' else [1, 0, 3, 2]
+        return np.diag([roles[i] for i in order])
+
+    @property
+    def R(self) -> np.ndarray:
+        """Weight of the torque, shape (1, 1)."""
+        return np.array([[self.torque]])
+
+
+def balance_regulator(
+    model: Model, stance: str, settings: BalanceSettings | None = None
+) -> Regulator:
+    """The balance controller of the upright robot on one leg, in continuous time.
+
+    Args:
+        model: A compass gait.
+        stance: Stance leg.
+        settings: Its scales are the weights, 1/scale^2.
+    """
+    s = settings or BalanceSettings()
+    weights = Weights(
+        1 / s.lean_scale**2, 1 / s.swing_scale**2, 1 / s.lean_rate_scale**2,
+        1 / s.swing_rate_scale**2, 1 / s.torque_scale**2,
+    )  # fmt: skip
+    linear = linearise_stance(model, stance)
+    return lqr(linear.A, linear.B, weights.Q(stance), weights.R)
+
+
+def stabilise(
+    trajectory: Trajectory,
+    model: Model,
+    weights: Weights | None = None,
+    final_cost: np.ndarray | None = None,
+    saltation: bool = True,
+) -> Trajectory:
+    """The trajectory with gains and cost to go at its knots.
+
+    Args:
+        trajectory: Planned for this model.
+        model: Linearised as its design model: no dry friction, delays and extra states.
+        weights: Of deviations.
+        final_cost: Q_f, shape (4, 4); None takes that of `balance_regulator` on the last leg.
+        saltation: (SALT) at impacts; False takes D alone, as if all robots landed on time.
+
+    Raises:
+        TrajectoryError: if the trajectory is another model's.
+    """
+    trajectory.require_model(model)
+    weights = weights or Weights()
+    S = final_cost
+    if S is None:
+        S = weights.final * balance_regulator(model, trajectory.modes[-1]).S
+    S = np.array(S, float)
+    if S.shape != (4, 4) or not np.allclose(S, S.T):
+        raise ValueError(f'final_cost must be a symmetric (4, 4) matrix, got shape {S.shape}')
+    design = design_model(model)
+    phases: list[Phase] = []
+    after: Phase | None = None
+    for phase in reversed(trajectory.phases):
+        if after is not None:
+            jump = jump_matrix(design, phase, after, trajectory.provenance.get('slope', 0.0))
+            if not saltation:
+                jump = impact_derivative(design, phase)
+            S = jump.T @ S @ jump
+        gains, costs = riccati(design, phase, weights.Q(phase.stance), weights.R, S)
+        S = costs[0]
+        after = phase
+        phases.append(
+            Phase(
+                phase.stance, phase.time, phase.states, phase.rates, phase.torque, gains, costs
+            )
+        )
+    return trajectory.with_phases(tuple(reversed(phases)), weights=vars(weights))
+
+
+def riccati(
+    design: Model, phase: Phase, Q: np.ndarray, R: np.ndarray, S: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(RIC) backward along one phase from S at its end.
+
+    Args:
+        design: Model to linearise.
+        phase: With n knots.
+        Q: Shape (4, 4).
+        R: Shape (1, 1).
+        S: At the end of the phase, shape (4, 4).
+
+    Returns:
+        Gains K, shape (n, 4), and costs to go S, shape (n, 4, 4), at the knots.
+    """
+    h = np.diff(phase.time)
+    first, second = (_between(phase, share) for share in GAUSS)
+    x = np.vstack([first[0], second[0], phase.states])
+    u = np.concatenate([first[1], second[1], phase.torque])
+    A, B = linearised(design, phase.stance, x, u)
+    n = len(h)
+    weight = np.linalg.inv(R)
+    H = np.empty((2 * n, 8, 8))
+    H[:, :4, :4] = A[: 2 * n]
+    H[:, :4, 4:] = -(B[: 2 * n] @ weight) @ B[: 2 * n].transpose(0, 2, 1)
+    H[:, 4:, :4] = -Q
+    H[:, 4:, 4:] = -A[: 2 * n].transpose(0, 2, 1)
+    H1, H2 = H[:n], H[n:]
+    step = h[:, None, None]
+    omega = step / 2 * (H1 + H2) - math.sqrt(3) / 12 * step**2 * (H1 @ H2 - H2 @ H1)
+    flow = exponentials(-omega)
+    costs = np.empty((n + 1, 4, 4))
+    costs[n] = S
+    for k in range(n - 1, -1, -1):
+        XY = flow[k, :, :4] + flow[k, :, 4:] @ S
+        S = np.linalg.solve(XY[:4].T, XY[4:].T)
+        S = (S + S.T) / 2
+        costs[k] = S
+    gains = (weight @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
+    return gains, costs
+
+
+def _between(phase: Phase, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """States and torques at one share of every interval."""
+    h = np.diff(phase.time)[:, None]
+    s, r = share, 1 - share
+    x0, x1, d0, d1 = phase.states[:-1], phase.states[1:], phase.rates[:-1], phase.rates[1:]
+    x = (1 + 2 * s) * r**2 * x0 + (1 + 2 * r) * s**2 * x1 + h * s * r * (r * d0 - s * d1)
+    return x, r * phase.torque[:-1] + s * phase.torque[1:]
+
+
+def linearised(
+    design: Model, stance: str, x: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A (n, 4, 4) and B (n, 4, 1) at n states (n, 4) and torques (n,)."""
+    setup = Setup(stance=stance)
+    function = _mapped(compile_model(design, setup), len(x))
+    A, B = function(x.T, u[None, :], parameter_vector(design, setup))[:2]
+    n = len(x)
+    # Columns stand side by side, one state's matrix after the other.
+    A = np.asarray(A).reshape(4, n, 4).transpose(1, 0, 2)
+    return A, np.asarray(B).T.reshape(n, 4, 1)
+
+
+@functools.cache
+def _mapped(compiled: CompiledModel, n: int) -> ca.Function:
+    x, u, p = (ca.MX.sym(s, m, k) for s, m, k in (
+        ('x', compiled.nx, n), ('u', compiled.nu, n), ('p', compiled.np, 1),
+    ))  # fmt: skip
+    A, B = jacobians(compiled).map(n)(x, u, ca.repmat(p, 1, n))[:2]
+    return ca.Function('along', [x, u, p], [A, B])
+
+
+def exponentials(a: np.ndarray) -> np.ndarray:
+    """Exp of each matrix of a stack (n, m, m): Pade of order 5 with scaling and squaring."""
+    norm = np.abs(a).sum(axis=-1).max()
+    # Below a norm of 0.25 the approximant of order 5 errs by less than 1e-13.
+    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300) / 0.25)))
+    a = a / 2**squarings
+    identity = np.eye(a.shape[-1])
+    a2 = a @ a
+    a4 = a2 @ a2
+    odd = a @ (a4 + 420 * a2 + 15120 * identity)
+    even = 30 * a4 + 3360 * a2 + 30240 * identity
+    result = np.linalg.solve(even - odd, even + odd)
+    for _ in range(squarings):
+        result = result @ result
+    return result
+
+
+def impact_derivative(model: Model, before: Phase) -> np.ndarray:
+    """D of (SALT), shape (4, 4): how the state after an impact follows the state before."""
+    x = before.states[-1]
+    function = _impact_jacobian(impact_function(model, before.stance))
+    by_q, by_v = function(x[:2], x[2:], parameter_vector(model, Setup(stance=before.stance)))
+    D = np.eye(4)
+    D[2:, :2], D[2:, 2:] = np.asarray(by_q), np.asarray(by_v)
+    return D
+
+
+@functools.cache
+def _impact_jacobian(function: ca.Function) -> ca.Function:
+    q, v, p = (ca.SX.sym(name, function.size1_in(i)) for i, name in enumerate('qvp'))
+    v_plus = function(q, v, p)[0]
+    return ca.Function('impact_jacobian', [q, v, p],
+                       [ca.jacobian(v_plus, q), ca.jacobian(v_plus, v)])  # fmt: skip
+
+
+def jump_matrix(model: Model, before: Phase, after: Phase, slope: float = 0.0) -> np.ndarray:
+    """(SALT), shape (4, 4), at the impact between two phases."""
+    D = impact_derivative(model, before)
+    x, tangent = before.states[-1], math.tan(slope)
+    st = STANCES.index(before.stance)
+    normal = np.zeros(4)
+    # Gradient of the height of the swing foot, (GUARD), over the leg length.
+    normal[st] = -math.sin(x[st]) + tangent * math.cos(x[st])
+    normal[1 - st] = math.sin(x[1 - st]) - tangent * math.cos(x[1 - st])
+    f_minus, f_plus = before.rates[-1], after.rates[0]
+    approach = normal @ f_minus
+    if not approach < 0:
+        raise TrajectoryError(
+            f'the swing foot does not come down at {before.end:.3f} s; its impact has no instant'
+        )
+    return D + np.outer(f_plus - D @ f_minus, normal) / approach

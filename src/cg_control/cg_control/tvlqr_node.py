@@ -1,0 +1,202 @@
+"""ROS node of the TVLQR controller: /state in, /torque_command out. Control is in execution.py.
+
+Until a trajectory is started it balances; then it follows the trajectory, and balances on the leg
+on which that ends. What it follows is the text on /trajectory/selected; when, is said by
+/trajectory: a motion starts, an empty one stops. Every state is answered by the command of its
+stamp, zero torque included, so that the same node works in real time and in lock-step.
+"""
+
+import json
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from cg_control.balance import BALANCING, BalanceController, balance_gains
+from cg_control.execution import CAUGHT, TRACKING, ExecutionSettings, TrajectoryController
+from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+from cg_dynamics.ros import (
+    LATCHED_QOS,
+    SENSOR_QOS,
+    DeclaredSettings,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
+from cg_dynamics.settings import setting
+
+NOMINAL_MODEL = 'compass_gait_mit'
+GAP = 0.02  # s between states after which the one before is history
+
+
+@dataclass(frozen=True)
+class TvlqrNodeSettings(ExecutionSettings):
+    """Parameters of the TVLQR node."""
+
+    model_file: str = setting('', 'model file of the robot; empty for the nominal compass gait')
+    sample_rate_hz: float = setting(
+        500.0, 'rate of the states', unit='Hz', minimum=10.0, maximum=2000.0
+    )
+    start_after: float = setting(
+        0.0, 'start the selected trajectory unasked, once, after balancing for so long; 0: never',
+        unit='s', minimum=0.0, live=True,
+    )  # fmt: skip
+
+
+class TvlqrNode(Node):
+    """Publishes /torque_command."""
+
+    def __init__(self, **kwargs):
+        super().__init__('tvlqr', **kwargs)
+        self.started = False
+        self.declared = DeclaredSettings(self, TvlqrNodeSettings, at_work=lambda: self.started)
+        settings = self.declared.values
+        self.model = Model.load(settings.model_file or model_path(NOMINAL_MODEL))
+        gains = balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz)
+        balance = BalanceController(self.model, settings, gains)
+        self.controller = TrajectoryController(balance, self.model, settings)
+        self.trajectory: Trajectory | None = None
+        self.problem = 'no trajectory selected yet'
+        self._adopted = settings
+        self._last_ns: int | None = None
+        self._reason = 'no state yet'
+        self._next_diagnosis = 0.0
+        self._balancing_since: int | None = None
+        self._started_unasked = False
+        self.message = JointState(name=['hip'])
+        self.message.header.frame_id = 'hip'
+        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
+        self.create_subscription(
+            String, '/trajectory/selected', self.on_selected, LATCHED_QOS
+        )
+        self.create_subscription(JointTrajectory, '/trajectory', self.on_order, SENSOR_QOS)
+        self.started = True
+
+    def on_selected(self, message: String) -> None:
+        """Take over the selected trajectory, if it is this robot's."""
+        try:
+            self.trajectory = Trajectory.from_text(message.data, self.model)
+            self.problem = ''
+        except TrajectoryError as error:
+            self.trajectory, self.problem = None, str(error)
+            self.get_logger().error(f'trajectory refused: {error}')
+
+    def on_order(self, message: JointTrajectory) -> None:
+        """Start or stop."""
+        if not message.points:
+            self.controller.stop()
+            return
+        self._start()
+
+    def _start(self) -> None:
+        problem = self.problem
+        if self.trajectory is not None:
+            problem = self.controller.start(self.trajectory)
+        if problem:
+            self.get_logger().error(f'trajectory not started: {problem}')
+
+    def _start_unasked(self, stamp_ns: int) -> None:
+        after = self.declared.values.start_after
+        if after == 0.0 or self._started_unasked or self.trajectory is None:
+            return
+        if self.controller.mode != BALANCING:
+            self._balancing_since = None
+            return
+        if self._balancing_since is None:
+            self._balancing_since = stamp_ns
+        if stamp_ns - self._balancing_since >= after * 1e9:
+            self._started_unasked = True
+            self._start()
+
+    def on_state(self, message: JointState) -> None:
+        """Answer a state."""
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        if stamp_ns == self._last_ns:
+            self.publisher.publish(self.message)
+            return
+        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
+            self.controller.interrupt()
+        self._last_ns = stamp_ns
+        if self._adopted is not self.declared.values:
+            self._adopted = self.declared.values
+            self.controller.adopt(self._adopted)
+        try:
+            stance, x = state_of(message)
+        except ValueError as error:
+            self.controller.interrupt()
+            self._reason = str(error)
+            self._send(stamp_ns, 0.0)
+            return
+        command = self.controller.step(stamp_ns, stance, x)
+        self._reason = command.reason
+        self._send(stamp_ns, command.torque)
+        self._start_unasked(stamp_ns)
+
+    def _send(self, stamp_ns: int, torque: float) -> None:
+        self.message.header.stamp = to_stamp(stamp_ns)
+        self.message.effort = [torque if math.isfinite(torque) else 0.0]
+        self.publisher.publish(self.message)
+
+    def poll(self) -> float:
+        """Say once a second how it goes."""
+        now = time.monotonic()
+        if now >= self._next_diagnosis:
+            self._next_diagnosis = now + 1.0
+            status = DiagnosticStatus(name='tvlqr', hardware_id='torque path')
+            mode = self.controller.mode
+            well = mode in (BALANCING, TRACKING, CAUGHT)
+            status.level = DiagnosticStatus.OK if well else DiagnosticStatus.WARN
+            status.message = mode + (f': {self._reason}' if self._reason else '')
+            values = {
+                'trajectory': json.dumps(self.trajectory.modes if self.trajectory else []),
+                'problem': self.problem,
+            }
+            status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
+            array = DiagnosticArray(status=[status])
+            array.header.stamp = to_stamp(time.time_ns())
+            self.diagnostics.publish(array)
+        return 0.2
+
+    def close(self) -> None:
+        """Leave with zero torque."""
+        if self._last_ns is not None:
+            self._send(self._last_ns, 0.0)
+
+
+def state_of(message: JointState) -> tuple[str, np.ndarray]:
+    """Stance leg and (q_inner, q_outer, rates) of a /state message.
+
+    Raises:
+        ValueError: naming what is missing.
+    """
+    stance = message.header.frame_id.removesuffix('_foot')
+    if stance not in STANCES:
+        raise ValueError(f'frame_id is {message.header.frame_id!r}; no foot of this robot')
+    names = list(message.name)
+    if len(message.position) != len(names) or len(message.velocity) != len(names):
+        raise ValueError('state without as many positions and velocities as names')
+    if any(leg not in names for leg in STANCES):
+        raise ValueError(f'state of {names}; expected {list(STANCES)}')
+    rows = [names.index(leg) for leg in STANCES]
+    q = [message.position[row] for row in rows]
+    return stance, np.array([*q, *(message.velocity[row] for row in rows)])
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_control tvlqr_node`."""
+    return run(TvlqrNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

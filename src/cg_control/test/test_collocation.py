@@ -1,0 +1,181 @@
+"""Planned motions against the exact hybrid model, and clear words where there is none."""
+
+import numpy as np
+import pytest
+
+from cg_control.collocation import (
+    Box,
+    Ellipsoid,
+    InfeasibleError,
+    Options,
+    Task,
+    UndecidedError,
+    optimise,
+    planning_model,
+    screen,
+)
+from cg_dynamics.gait import find_gait
+from cg_dynamics.hybrid import WalkOptions, walk
+from cg_dynamics.impact import impact
+
+REBALANCE = Task(('inner', 'outer'), reach=0.2)
+
+
+def played(trajectory, model):
+    """The exact hybrid model under the nominal torque alone."""
+
+    def command(t, stance, x):
+        return np.array([trajectory.at(t + 0.001).torque])
+
+    return walk(
+        model, trajectory.modes[0], trajectory.states[0], trajectory.duration, command,
+        WalkOptions(step=5e-4),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize('friction', [False, True])
+@pytest.mark.parametrize('modes', [('inner', 'outer'), ('outer', 'inner')])
+def test_one_step_rebalance_is_a_motion_of_the_exact_model(robot, modes, friction):
+    task = Task(modes, reach=0.2)
+    trajectory = optimise(robot, task, friction=friction)
+    np.testing.assert_allclose(trajectory.states[0], 0, atol=1e-6)
+    np.testing.assert_allclose(trajectory.states[-1], 0, atol=1e-6)
+    assert np.abs(trajectory.torque).max() <= robot.torque_limit
+    done = played(trajectory, planning_model(robot, friction))
+    assert [event.kind for event in done.events] == ['impact']
+    assert done.stance == modes[1]
+    # The upright robot amplifies by exp(3.2 * 1 s) what collocation errs at 20 knots a phase;
+    # dry friction, which turns its sign within 0.01 rad/s, costs collocation its order.
+    tolerance = 0.02 if friction else 2e-4
+    assert abs(done.impacts[0].time - trajectory.impact_times[0]) < tolerance
+    np.testing.assert_allclose(done.state, trajectory.states[-1], atol=tolerance)
+
+
+def test_more_knots_bring_the_cost_no_lower(robot):
+    """The coarse cost is near the fine one: they are the same problem."""
+    coarse = screen(planning_model(robot, False), REBALANCE)
+    fine = optimise(robot, REBALANCE, friction=False)
+    assert coarse.verdict == 'feasible'
+    assert coarse.best.cost == pytest.approx(fine.provenance['cost'], rel=0.05)
+
+
+def test_goal_regions_are_met_and_make_the_motion_cheaper(robot):
+    form = np.diag([1 / 0.03**2, 1 / 0.05**2, 1 / 0.1**2, 1 / 0.2**2])
+    region = optimise(
+        robot, Task(('inner', 'outer'), goal=Ellipsoid(np.zeros(4), form), reach=0.2),
+        friction=False,
+    )  # fmt: skip
+    end = region.states[-1]
+    assert 0 < end @ form @ end <= 1 + 1e-5
+    point = optimise(robot, REBALANCE, friction=False)
+    assert region.provenance['cost'] < point.provenance['cost']
+    box = optimise(
+        robot,
+        Task(('inner', 'outer'), goal=Box([0, 0, -0.1, -0.1], [0, 0, 0.1, 0.1]), reach=0.2),
+        friction=False,
+    )
+    assert box.provenance['cost'] < point.provenance['cost']
+    assert np.abs(box.states[-1]).max() <= 0.1 + 1e-5
+
+
+def test_limits_of_torque_and_its_rate_hold(robot):
+    free = optimise(robot, REBALANCE, friction=False)
+    peak = np.abs(free.torque).max()
+    weak = optimise(robot, Task(('inner', 'outer'), reach=0.2, torque_limit=0.9 * peak),
+                    friction=False)  # fmt: skip
+    assert np.abs(weak.torque).max() <= 0.9 * peak + 1e-5
+    steep = [np.abs(np.diff(p.torque) / np.diff(p.time)).max() for p in free.phases]
+    smooth = optimise(
+        robot, Task(('inner', 'outer'), reach=0.2, rate_limit=0.8 * max(steep)), friction=False
+    )
+    slopes = [np.abs(np.diff(p.torque) / np.diff(p.time)).max() for p in smooth.phases]
+    assert max(slopes) <= 0.8 * max(steep) * (1 + 1e-4)
+
+
+def test_retracted_foot_stays_within_its_retraction(robot):
+    task = Task(('inner', 'outer'), reach=0.2, retraction=0.01)
+    trajectory = optimise(robot, task, friction=False)
+    q = trajectory.phases[0].states[:, :2]
+    l = robot.values['leg_length']
+    height = l * (np.cos(q[:, 0]) - np.cos(q[:, 1]))
+    reach = l * (np.sin(q[:, 0]) - np.sin(q[:, 1]))
+    assert height.min() >= -0.01 - 1e-6
+    assert height[reach > 0.05].min() >= -1e-4
+
+
+@pytest.mark.parametrize(
+    ('task', 'message'),
+    [
+        (Task(('inner',), goal=Box.point([0.0, 0.0, 9.0, 0.0])), 'inner from .* within 40 N m'),
+        (Task(('inner', 'outer'), torque_limit=0.0), 'within 0 N m'),
+        (Task(('inner',), start=Box.point([0.3, 0, 1.5, 0])), 'nearest misses'),
+    ],
+)
+def test_impossible_tasks_are_infeasible_and_say_by_how_much(robot, task, message):
+    with pytest.raises(InfeasibleError, match=message):
+        optimise(robot, task)
+
+
+def test_being_out_of_time_is_not_infeasible(robot):
+    with pytest.raises(UndecidedError, match='there may be one'):
+        optimise(robot, REBALANCE, Options(seconds=0.0))
+    with pytest.raises(UndecidedError):
+        optimise(robot, REBALANCE, Options(coarse_iterations=2))
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (lambda: Box.point([0, 0, np.nan, 0]), '4 finite numbers'),
+        (lambda: Box([0, 0, 0, 1], [0, 0, 0, 0]), 'lower bounds above'),
+        (lambda: Task(('left',)), "'left' is not one of inner, outer"),
+        (lambda: Task(('inner',), torque_limit=-1.0), 'must not be negative'),
+        (lambda: Task(('inner',), durations=(1.0, 0.5)), 'increasing'),
+    ],
+)
+def test_nonsense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_plan_names_its_model(robot):
+    trajectory = optimise(robot, REBALANCE)
+    assert trajectory.model_hash == robot.hash
+    assert trajectory.provenance['friction'] == 'planned'
+
+
+# The classic passive walker: two point-mass legs of 5 kg at half of 1 m, 10 kg at the hip.
+CLASSIC = {
+    'leg_length': 1.0, 'total_mass': 20.0, 'gravity': 9.81, 'c1': 0.0625 + 1e-7,
+    'c2': 0.0625 + 1e-7, 'c3': 1e-7, 'c4': 0.125, 'c5': 0.125, 'c6': 0.0,
+}  # fmt: skip
+
+
+def test_passive_gait_is_that_of_the_hybrid_simulation(robot):
+    """Found by collocation and by Newton's method on the walk itself, on 3 degrees."""
+    slope = 0.0525
+    walker = planning_model(robot, False).with_values(CLASSIC)
+    anywhere = Box.anywhere()
+    task = Task(
+        ('inner',), anywhere, anywhere, periodic=True, torque_limit=0.0, slope=slope,
+        durations=(0.2, 1.5), reach=0.2,
+    )  # fmt: skip
+    found = optimise(walker, task)
+    assert np.abs(found.torque).max() < 1e-9
+    x0 = found.states[0]
+    guess = [(x0[1] - x0[0]) / 2, x0[2], x0[3]]
+    gait = find_gait(walker, 'inner', guess, WalkOptions(slope=slope), steps=1)
+    # What Hermite-Simpson errs with 20 intervals.
+    np.testing.assert_allclose(gait.x0, x0, atol=2e-4)
+    assert gait.period == pytest.approx(found.duration, abs=2e-4)
+
+
+def test_gait_on_flat_ground_repeats_itself(robot):
+    walker = planning_model(robot, False).with_values(CLASSIC)
+    anywhere = Box.anywhere()
+    task = Task(('inner',), anywhere, anywhere, periodic=True, reach=0.4, durations=(0.2, 1.5))
+    found = optimise(walker, task)
+    done = played(found, walker)
+    assert len(done.impacts) <= 1
+    after = impact(walker, 'inner', found.states[-1]).x_plus
+    np.testing.assert_allclose(after[[1, 0, 3, 2]], found.states[0], atol=1e-5)
