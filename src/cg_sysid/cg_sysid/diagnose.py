@@ -64,6 +64,7 @@ SHOWS = 3.0  # standard deviations from which a small fault is there at all
 FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
+SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int], None]
 
 
@@ -183,9 +184,13 @@ class _Search:
     def _extend(self, o: Outcome) -> Outcome:
         """Accept one effect after the other, until nothing more is earned."""
         while len(self._added(o)) < self.options.rounds:
-            o = self._with_small_faults(o)
+            plain, o = o, self._with_small_faults(o)
             if settled(o):
-                break
+                cause = self._rather_one_cause(plain, o)
+                if cause is None:
+                    break
+                o = cause
+                continue
             contest = self._contest(o)
             winner = contest.winner()
             self._note(contest, winner[0].label if winner else '')
@@ -217,6 +222,24 @@ class _Search:
             return o
         # Beside a large cause they would explain a little of it; then they can wait.
         return found if chi2(found) < MOST_OF_IT * chi2(o) else o
+
+    def _rather_one_cause(self, plain: Outcome, faulty: Outcome) -> Outcome | None:
+        """One effect that alone explains more than all small faults together, if there is one.
+
+        Together they can imitate much, but hardly down to the last of it.
+        """
+        if settled(plain):
+            return None
+        contest = self._contest(plain)
+        winner = contest.winner()
+        if winner is None:
+            return None
+        both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
+        (first, _), (second, _) = both.ranked
+        if first.label == SMALL_FAULTS or first.evidence < second.evidence + both.margin:
+            return None
+        self._note(contest, first.label)
+        return self._refitted(winner[1])
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
         """Without those small faults that, beside the causes, explain nothing any more."""
