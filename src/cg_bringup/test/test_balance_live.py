@@ -101,9 +101,14 @@ def test_lock_step_balances_and_repeats_to_the_bit(loop):
         ('observer', signal.SIGKILL),
         ('balance', signal.SIGKILL),
         ('safety_gate', signal.SIGKILL),
+        ('observer', signal.SIGSTOP),
         ('balance', signal.SIGSTOP),
+        ('safety_gate', signal.SIGSTOP),
     ],
-    ids=['observer dies', 'controller dies', 'gate dies', 'controller hangs'],
+    ids=[
+        'observer dies', 'controller dies', 'gate dies',
+        'observer hangs', 'controller hangs', 'gate hangs',
+    ],
 )
 def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):
     # Springs hold the robot up, so that a machine too busy for real time does not end the test.

@@ -38,6 +38,7 @@ from cg_sysid.record import Record
 
 WINDOW = 4.0  # s; resolves 0.25 Hz
 BAND = (2.0, 25.0)  # Hz, in which a resonance is looked for
+EXCITED = 1e-3  # of the largest spectral density of the torque
 COHERENT = 0.6  # coherence below which a frequency does not count
 PEAK = 2.0  # times the level beside it: less is no resonance
 BESIDE = 2.5  # the level is taken this factor in frequency below the peak
@@ -132,7 +133,8 @@ def response(record: Record, channel: str, window: float = WINDOW) -> Response:
     windows = 2 * len(u) // n - 1
     # Half-overlapping Hann windows are worth 0.95 of as many independent ones (Welch, 1967).
     averages = max(1.0, 0.95 * windows)
-    keep = (frequency > 0) & (S_uu > 1e-12 * S_uu.max()) & (S_yy > 0)
+    # What was not excited has no response, only leakage.
+    keep = (frequency > 0) & (S_uu > EXCITED * S_uu.max()) & (S_yy > 0)
     H = S_uy[keep] / S_uu[keep]
     coherence = np.clip(np.abs(S_uy[keep]) ** 2 / (S_uu[keep] * S_yy[keep]), 1e-9, 1.0)
     sigma = np.abs(H) * np.sqrt((1.0 - coherence) / (2.0 * averages * coherence))
@@ -237,20 +239,20 @@ def flexible_start(model: Model, setup: Setup, found: Resonance) -> Model:
 
 
 def magnitude_trace(
-    signal: np.ndarray, sample_time: float, high_pass: float = 2.0, low_pass: float = 0.5
+    signal: np.ndarray, sample_time: float, high_pass: float = 5.0, low_pass: float = 1.0
 ) -> np.ndarray:
     """The seed's trace of a signal's high-frequency magnitude: high-pass, abs, low-pass.
 
     Args:
         signal: Samples, shape (n,).
         sample_time: In s.
-        high_pass: Cutoff in Hz of a second-order Butterworth filter.
+        high_pass: Cutoff in Hz of a fourth-order Butterworth filter.
         low_pass: Cutoff in Hz of a first-order filter.
 
     Returns:
         Amplitude of what a sine would need for that mean magnitude, shape (n,).
     """
-    sections = butter(2, high_pass, 'highpass', fs=1.0 / sample_time, output='sos')
+    sections = butter(4, high_pass, 'highpass', fs=1.0 / sample_time, output='sos')
     rectified = np.abs(sosfilt(sections, signal - signal[0]))
     b, a = butter(1, low_pass, fs=1.0 / sample_time)
     return lfilter(b, a, rectified) * np.pi / 2

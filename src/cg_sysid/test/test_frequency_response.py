@@ -110,7 +110,7 @@ def test_magnitude_trace_is_the_amplitude_of_a_sine():
     t = np.arange(5000) * T
     slow, fast = np.sin(2 * np.pi * 0.1 * t), 0.2 * np.sin(2 * np.pi * 12.0 * t) * (t > 5.0)
     trace = magnitude_trace(slow + fast, T)
-    # The 0.1 Hz motion leaves (0.1/2)^2 of itself.
+    # The 0.1 Hz motion leaves (0.1/5)^4 of itself, after its start.
     assert trace[2000:2500].max() < 0.01
     assert trace[-500:].mean() == pytest.approx(0.2, rel=0.05)
 
