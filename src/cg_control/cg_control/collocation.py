@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 
 from cg_control.trajectory import Phase, Trajectory
-from cg_control.transcription import KNOT, RATE_SCALE, Structure, Transcription, transcribe
+from cg_control.transcription import (
+    KNOT,
+    MEMORY_UNITS,
+    RATE_SCALE,
+    UNITS,
+    Structure,
+    Transcription,
+    transcribe,
+)
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.linearise import DRY_FRICTION
 from cg_dynamics.model import Model
@@ -246,7 +254,7 @@ WEAK = 1e-4  # weight of the running cost in the elastic program
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 BALLISTIC = 0.2  # s
 ELASTIC_ITERATIONS = 60
-FAR = 1.0  # a miss by so much is believed at once; a nearer one must be left by every guess
+FAR = 1.0  # within one phase a miss by so much is believed at once; others must be every guess's
 
 
 @dataclass(frozen=True)
@@ -346,8 +354,8 @@ class Program:
                 low, high = np.maximum(low, task.start.lower), np.minimum(high, task.start.upper)
             if (i, k) == last and isinstance(task.goal, Box) and not elastic:
                 low, high = np.maximum(low, task.goal.lower), np.minimum(high, task.goal.upper)
-            lower[at : at + 4], upper[at : at + 4] = low, high
-            lower[at + 6], upper[at + 6] = -self.limit, self.limit
+            lower[at : at + 4], upper[at : at + 4] = low / UNITS[:4], high / UNITS[:4]
+            lower[at + 6], upper[at + 6] = -self.limit / UNITS[6], self.limit / UNITS[6]
             if k == 0:
                 lower[at + 7], upper[at + 7] = task.durations
         return lower, upper
@@ -406,13 +414,13 @@ class Program:
         memory = self.transcription.memory
         for i, k, at, size in self._columns():
             nx = self.transcription.nx
-            z[at : at + KNOT] = start.knots[i][k]
+            z[at : at + KNOT] = start.knots[i][k] / UNITS
             z[at + 7] = start.durations[i]
-            z[at + 8 : at + 8 + memory] = start.knots[0][0][:4] if memory else []
+            z[at + 8 : at + 8 + memory] = (start.knots[0][0][:4] / MEMORY_UNITS)[:memory]
             if k < self.intervals:
-                z[at + nx : at + size] = start.knots[i][k + 1]
+                z[at + nx : at + size] = start.knots[i][k + 1] / UNITS
             elif i < len(self.task.modes) - 1:
-                z[at + nx : at + size - 1] = start.knots[i + 1][0][4:]
+                z[at + nx : at + size - 1] = (start.knots[i + 1][0] / UNITS)[4:]
                 z[at + size - 1] = start.durations[i + 1]
         return z
 
@@ -434,7 +442,7 @@ class Program:
         knots: list[list[np.ndarray]] = [[] for _ in self.task.modes]
         durations = [0.0] * len(self.task.modes)
         for i, _, at, _ in self._columns():
-            knots[i].append(z[at : at + KNOT])
+            knots[i].append(z[at : at + KNOT] * UNITS)
             durations[i] = float(z[at + 7])
         stats = solver.stats()
         finite = bool(np.isfinite(z).all())
@@ -503,7 +511,7 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
             miss = math.sqrt(max(near.cost - WEAK * elastic.running_cost(near), 0.0))
             if near.converged and miss > MISSED:
                 misses.append(miss)
-                if miss > FAR and not task.periodic:
+                if miss > FAR and len(task.modes) == 1 and not task.periodic:
                     break
             elif near.converged:
                 found = strict.solve(near, options.coarse_iterations, options.tolerance)
