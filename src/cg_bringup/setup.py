@@ -45,6 +45,7 @@ setup(
             'rebalance = cg_bringup.rebalance_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
+            'replay = cg_bringup.replay:main',
         ],
     },
 )

@@ -52,6 +52,7 @@ setup(
             'identify = cg_sysid.identify_cli:main',
             'diagnose = cg_sysid.diagnose_cli:main',
             'report = cg_sysid.report_cli:main',
+            'frequency_response = cg_sysid.frequency_response:main',
         ],
     },
 )

@@ -85,6 +85,7 @@ def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
         'duration': options.duration,
         'await_answer': True,
         'experiment': 'balance',
+        'closed_loop': True,
         'exit_when_done': True,
         **rate,
     }

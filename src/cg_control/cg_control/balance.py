@@ -188,7 +188,8 @@ class BalanceController:
         self.settings, self.gains, self.basins = settings, dict(gains), basins
         self.mode = IDLE
         self.falls = 0
-        self._law: tuple | None = None
+        self._designs = 0
+        self._law: tuple[str, int] | None = None
         self._last_ns: int | None = None
         self._torque = 0.0
         self._offset = 0.0
@@ -199,11 +200,14 @@ class BalanceController:
         """Largest torque commanded, N m."""
         return min(self.settings.torque_limit or math.inf, self.model_limit)
 
-    def adopt(self, settings: BalanceSettings, gains: Mapping[str, np.ndarray] | None = None):
+    def adopt(
+        self, settings: BalanceSettings, gains: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         """New settings, and new gains with them, from the next step on."""
         self.settings = settings
         if gains is not None:
             self.gains = dict(gains)
+            self._designs += 1
 
     def stop(self) -> None:
         """Zero torque; engages again when the state allows it."""
@@ -227,14 +231,15 @@ class BalanceController:
         wanted = -float(self.gains[stance] @ x[: len(self.gains[stance])])
         wanted = min(max(wanted, -self.torque_limit), self.torque_limit)
         # A different law must not make the torque jump: the difference dies out.
-        law = (stance, id(self.gains[stance]))
+        law = (stance, self._designs)
         elapsed = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / NANOSECONDS
-        if law != self._law:
-            self._offset, self._law = self._torque - wanted, law
-        elif self.settings.hand_over > 0.0:
-            self._offset *= math.exp(-max(elapsed, 0.0) / self.settings.hand_over)
-        else:
+        if self.settings.hand_over == 0.0:
             self._offset = 0.0
+        elif law != self._law:
+            self._offset = self._torque - wanted
+        else:
+            self._offset *= math.exp(-max(elapsed, 0.0) / self.settings.hand_over)
+        self._law = law
         torque = self._smoothed(wanted + self._offset, elapsed)
         self._torque, self._last_ns = torque, stamp_ns
         torque += self.friction.torque(x[2] - x[3], self.settings)

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -73,7 +74,8 @@ class BalanceNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, BalanceNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        self.path = settings.model_file or str(model_path(NOMINAL_MODEL))
+        given = settings.model_file
+        self.path = str(Path(given).expanduser() if given else model_path(NOMINAL_MODEL))
         self.model = Model.load(self.path)
         gains = self._gains(settings)
         self.controller = BalanceController(self.model, settings, gains)

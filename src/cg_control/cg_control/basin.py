@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from cg_control.linearise import linearise_stance
+from cg_control.linearise import linearise_stance, without_extra_states
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
@@ -134,9 +134,7 @@ def sample_basin(
         seed: Of the directions.
     """
     modes = modes_of(model, stance)
-    for effect in model.effects:
-        if effect.states or effect.extra_inputs:
-            model = model.without_effect(effect.label)
+    model = without_extra_states(model)
     caught = _Trial(model, stance, gain, torque_limit)
     bounds: list[float] = []
     for swing in SWINGS:

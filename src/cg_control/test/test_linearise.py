@@ -18,10 +18,27 @@ FLEXIBLE = MODEL.with_effect(
 
 
 def test_design_model_keeps_bodies_and_viscous_friction_only():
-    assert [effect.name for effect in design_model(FLEXIBLE).effects] == ['viscous_friction']
+    assert [effect.name for effect in design_model(MODEL).effects] == ['viscous_friction']
+    late = MODEL.with_effect('actuator_delay', delay=0.003).with_effect('imu_offset', offset=0.01)
     np.testing.assert_array_equal(
-        linearise_stance(FLEXIBLE, 'inner').A, linearise_stance(MODEL, 'inner').A
+        linearise_stance(late, 'inner').A, linearise_stance(MODEL, 'inner').A
     )
+
+
+def test_rotor_behind_a_spring_turns_with_the_joint():
+    """The design model is the limit of a stiff spring."""
+    kept = design_model(FLEXIBLE)
+    assert kept.values['rotor_inertia.inertia'] == 0.5
+    added = design_model(FLEXIBLE.with_effect('rotor_inertia', inertia=0.1))
+    assert added.values['rotor_inertia.inertia'] == pytest.approx(0.6)
+    stiff = FLEXIBLE.with_values(
+        {'joint_flexibility.stiffness': 1e5, 'joint_flexibility.damping': 1.0}
+    )
+    slow = np.sort_complex(np.linalg.eigvals(linearise_stance(stiff, 'inner', elastic=True).A))
+    slow = slow[np.abs(slow) < 10]
+    rigid = np.sort_complex(np.linalg.eigvals(linearise_stance(FLEXIBLE, 'inner').A))
+    # A spring of 1e5 N m/rad resonates at 500 1/s: (3/500)^2 of the eigenvalues.
+    np.testing.assert_allclose(slow, rigid, rtol=1e-4)
 
 
 def test_upright_eigenvalues_are_those_of_the_frictionless_robot():

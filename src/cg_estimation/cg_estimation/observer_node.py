@@ -8,6 +8,7 @@ repeated measurement (lock-step) is answered by the same state.
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
@@ -25,7 +26,8 @@ from cg_estimation.samples import Gatherer
 
 NOMINAL_MODEL = 'compass_gait_mit'
 LOADED = 0.5  # N, or the 1 of a plain switch
-ROTOR = 'hip_rotor'
+ROTOR, ROTOR_STATE = 'hip_rotor', 'joint_flexibility.rotor_angle'
+NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
 REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
 
 
@@ -47,24 +49,32 @@ class ObserverNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, ObserverNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        path = settings.model_file or model_path(NOMINAL_MODEL)
+        given = settings.model_file
+        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
         told = settings.stance == 'contacts'
         self.estimator = make_estimator(
             settings, Model.load(path), Setup(stance='inner' if told else settings.stance)
         )
         self.gatherer = Gatherer(contacts=told)
-        rotor = len(self.estimator.state_names) == 6
-        self.message = JointState(name=[*STANCES, *([ROTOR] if rotor else [])])
-        self._order = [0, 1, 4] if rotor else [0, 1]
+        # Other states of effects, of sensors say, are of no use to a controller.
+        self._angles, self._rates = [0, 1], [2, 3]
+        if ROTOR_STATE in self.estimator.state_names:
+            rotor = self.estimator.state_names.index(ROTOR_STATE)
+            self._angles, self._rates = [0, 1, rotor], [2, 3, rotor + 1]
+        self.message = JointState(name=[*STANCES, ROTOR][: len(self._angles)])
         self._published = 0
         self._withheld = 0
         self._longest = 0.0
         self._next_diagnosis = 0.0
         self._last_ns = 0
+        self._begun = False
+        self._first_heard: float | None = None
         self.publisher = self.create_publisher(JointState, '/state', SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.applied = self.create_subscription(
+            JointState, '/applied_torque', self.on_torque, SENSOR_QOS
+        )
         for kind, topic, heard in (
-            (JointState, '/applied_torque', self.on_torque),
             (JointState, '/hip_encoder', self.on_encoder),
             (WrenchStamped, '/foot_contact/inner', lambda m: self.on_contact('inner', m)),
             (WrenchStamped, '/foot_contact/outer', lambda m: self.on_contact('outer', m)),
@@ -107,7 +117,7 @@ class ObserverNode(Node):
         if stamp_ns < self._last_ns - REPEATED_START:
             self.gatherer.restart()
             self.estimator.reset()
-            self._last_ns = 0
+            self._last_ns, self._begun = 0, False
         if stamp_ns == self._last_ns and 'imu_angle' in outputs:
             self.publisher.publish(self.message)
             return
@@ -115,7 +125,17 @@ class ObserverNode(Node):
         self._use()
 
     def _use(self) -> None:
+        if not self._begun and not self._hears_the_drive():
+            return
         for measurement in self.gatherer.due():
+            if not self._begun and self.declared.values.stance == 'contacts':
+                if measurement.stance is None:
+                    self.get_logger().warning(
+                        'the foot contacts do not tell which leg stands; no state is published',
+                        throttle_duration_sec=1.0,
+                    )
+                    continue
+            self._begun = True
             start = time.perf_counter()
             settings = self.declared.values
             tune(self.estimator, settings)
@@ -125,6 +145,12 @@ class ObserverNode(Node):
             self._publish(estimate, settings.longest_blind)
             self._last_ns = measurement.stamp_ns
             self._longest = max(self._longest, time.perf_counter() - start)
+
+    def _hears_the_drive(self) -> bool:
+        """True if the drive is heard, or there is none: discovery takes its time."""
+        now = time.monotonic()
+        self._first_heard = self._first_heard or now
+        return self.applied.get_publisher_count() > 0 or now > self._first_heard + NO_DRIVE
 
     def _publish(self, estimate: Estimate, longest_blind: float) -> None:
         if not estimate.blind <= longest_blind:
@@ -137,9 +163,8 @@ class ObserverNode(Node):
         x = estimate.x
         self.message.header.stamp = to_stamp(estimate.stamp_ns)
         self.message.header.frame_id = f'{estimate.stance}_foot'
-        self.message.position = [float(x[i]) for i in self._order]
-        rates = [2, 3, 5] if len(self._order) == 3 else [2, 3]
-        self.message.velocity = [float(x[i]) for i in rates]
+        self.message.position = [float(x[i]) for i in self._angles]
+        self.message.velocity = [float(x[i]) for i in self._rates]
         self.publisher.publish(self.message)
         self._published += 1
 

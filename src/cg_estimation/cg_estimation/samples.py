@@ -1,13 +1,18 @@
 """Messages of one instant come on several topics; here they become one measurement. No ROS.
 
-A measurement is whole when its IMU, encoder and (if they speak at all) foot contacts are there,
-and the torque that the drive held since the one before is known. Whole ones are given out at
-once and in order. One that stays in parts is given out as it is once PATIENCE newer IMU samples
-have come: in lock-step, where nothing moves on without an answer, that never happens.
+A measurement is whole when its IMU, encoder and (if they are to tell the stance leg) foot contacts
+are there, and the torque that the drive held since the one before is known. Whole ones are given
+out at once and in order. One that stays in parts is given out as it is once PATIENCE newer IMU
+samples have come: in lock-step, where nothing moves on without an answer, that never happens.
+
+The stance leg is the one that has just been loaded, or else the only one that is: when the swing
+foot lands, both feet may be down for some samples, and the impact is at the first of them.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+
+from cg_dynamics.rig import STANCES
 
 PATIENCE = 2
 KEPT = 64  # measurements in parts; more than that are of a clock that jumped
@@ -57,7 +62,7 @@ class Gatherer:
         self._waiting: dict[int, Sample] = {}
         self._last_ns: int | None = None
         self._torque, self._torque_ns = 0.0, -1
-        self._speak: set[str] = set()
+        self._pressed: dict[str, bool] = {}
 
     def add(self, stamp_ns: int, outputs: dict[str, float]) -> None:
         """Readings of one instant."""
@@ -67,7 +72,6 @@ class Gatherer:
 
     def add_contact(self, stamp_ns: int, leg: str, loaded: bool) -> None:
         """A foot contact."""
-        self._speak.add(leg)
         sample = self._at(stamp_ns)
         if sample is not None:
             sample.contact[leg] = loaded
@@ -81,6 +85,7 @@ class Gatherer:
         """The clock has jumped back: forget what was."""
         self._waiting.clear()
         self._last_ns, self._torque, self._torque_ns = None, 0.0, -1
+        self._pressed = {}
 
     def due(self) -> Iterator[Measurement]:
         """The measurements that may be used now, in order."""
@@ -105,13 +110,16 @@ class Gatherer:
         return self._waiting.setdefault(stamp_ns, Sample(stamp_ns))
 
     def _whole(self, sample: Sample) -> bool:
-        known = self._last_ns is None or self._torque_ns < 0 or self._torque_ns >= self._last_ns
+        known = self._last_ns is None or self._torque_ns >= self._last_ns
         return (
             known
             and {'imu_angle', 'hip_angle'} <= sample.outputs.keys()
-            and (not self.contacts or self._speak <= sample.contact.keys())
+            and (not self.contacts or len(sample.contact) == len(STANCES))
         )
 
     def _stance(self, sample: Sample) -> str | None:
-        loaded = [leg for leg, pressed in sample.contact.items() if pressed]
-        return loaded[0] if self.contacts and len(loaded) == 1 else None
+        before, self._pressed = self._pressed, self._pressed | sample.contact
+        landed = [leg for leg, on in self._pressed.items() if on and not before.get(leg, True)]
+        loaded = [leg for leg, on in self._pressed.items() if on]
+        told = landed if len(landed) == 1 else loaded
+        return told[0] if self.contacts and len(told) == 1 else None

@@ -92,6 +92,9 @@ class SimulationSettings(Settings):
         'model file that the recording note names, where the machine deviates from it on '
         'purpose; empty for model_file',
     )
+    closed_loop: bool = setting(
+        False, 'for the recording note: a feedback controller makes the torque'
+    )
     notes: str = setting('', 'free text for the recording note')
     autostart: bool = setting(True, 'configure and activate without being asked')
     exit_when_done: bool = setting(False, 'end the process after `duration` or a failure')
@@ -176,6 +179,7 @@ def recording_note(
         'model_file': path.name,
         'model_sha256': hashlib.sha256(path.read_bytes()).hexdigest(),
         'software': SOFTWARE,
+        'closed_loop': settings.closed_loop,
         'notes': settings.notes,
     }
     return yaml.safe_dump(note, sort_keys=False, allow_unicode=True)

@@ -70,3 +70,11 @@ def test_pace_takes_samples_when_they_are_due_and_leaves_none_out():
     assert taken == 9  # those due at 4, 6, ... 20 ms
     assert pace.worst_ns == 16 * MS
     assert pace.late == 7  # later than one period: those due at 4 ... 16 ms
+
+
+def test_pushes_hit_at_their_sample():
+    settings = SimulationSettings(pushes=(0.1, 2.0, 0.5, -1.0))
+    hits = {tick: settings.pushes_at(tick) for tick in range(500) if settings.pushes_at(tick)}
+    assert hits == {50: 2.0, 250: -1.0}
+    with pytest.raises(ValueError, match='pushes has 3 numbers'):
+        SimulationSettings(pushes=(0.1, 2.0, 0.5))

@@ -140,6 +140,16 @@ def test_lockstep_works_through_the_safety_gate(bench):
     assert [m.effort[0] for m in bench.applied] == [1.0] * 10 + [2.0] * 10
 
 
+def test_real_time_can_wait_for_the_controller_with_its_first_measurement(bench):
+    machine = bench.machine(await_answer=True, duration=0.1, initial_state=[0.2, 0.2, 0.0, 0.0])
+    bench.until(lambda: len(bench.measured) >= 4)
+    assert len(set(stamps(bench.measured))) == 1
+    assert machine.plant.state[0] == 0.2
+    bench.answer = lambda message: 0.0
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 50)
+    assert machine.plant.state[0] > 0.2  # it has begun to fall
+
+
 @pytest.mark.parametrize(('torque', 'applied'), [(math.nan, 0.0), (100.0, 40.0), (-55.0, -40.0)])
 def test_lockstep_bad_commands_never_reach_the_motor(bench, torque, applied):
     bench.answer = lambda message: torque

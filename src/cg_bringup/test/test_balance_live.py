@@ -1,0 +1,130 @@
+"""The balancing loop as processes on topics: deterministic in lock-step, safe when one dies."""
+
+import signal
+import time
+
+import pytest
+import yaml
+
+rclpy = pytest.importorskip('rclpy')
+
+from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+
+from cg_bringup.balance_run import BalanceOptions, balance_nodes, start, stop  # noqa: E402
+from cg_dynamics.domains import own_domain  # noqa: E402
+from cg_dynamics.ros import to_nanoseconds  # noqa: E402
+from cg_sysid.experiments import load_experiment  # noqa: E402
+
+PATIENCE = 60.0  # s for start-up on a busy machine
+ENOUGH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+STALE_NS = 20_000_000
+SAMPLE_NS = 2_000_000
+
+
+class Loop:
+    """The processes and an ear on the drive."""
+
+    def __init__(self, directory, setup=None, **options):
+        self.node = Node('ear')
+        self.applied, self.states = [], []
+        self.node.create_subscription(JointState, '/applied_torque', self.on_applied, ENOUGH)
+        self.node.create_subscription(JointState, '/state', self.states.append, ENOUGH)
+        self.executor = EventsExecutor()
+        self.executor.add_node(self.node)
+        self.log = (directory / 'log').open('w+')
+        nodes = balance_nodes(BalanceOptions(**options))
+        if setup is not None:
+            nodes['simulation_node'].parameters['setup'] = yaml.safe_dump(setup.to_dict())
+        self.processes = start(nodes, directory, self.log)
+
+    def on_applied(self, message):
+        self.applied.append((to_nanoseconds(message.header.stamp), message.effort[0]))
+
+    def until(self, condition, patience=PATIENCE):
+        deadline = time.monotonic() + patience
+        while not condition():
+            self.log.seek(0)
+            assert time.monotonic() < deadline, self.log.read()
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def close(self):
+        stop(self.processes)
+        self.executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.log.close()
+
+
+@pytest.fixture
+def loop(tmp_path):
+    loops = []
+
+    def make(setup=None, **options):
+        directory = tmp_path / str(len(loops))
+        directory.mkdir()
+        loops.append(Loop(directory, setup, **options))
+        return loops[-1]
+
+    with own_domain():
+        rclpy.init()
+        yield make
+        for each in loops:
+            each.close()
+        rclpy.try_shutdown()
+
+
+def test_lock_step_balances_and_repeats_to_the_bit(loop):
+    torques = []
+    for _ in range(2):
+        run = loop(
+            mode='lockstep', duration=1.0, stance='outer', lean=0.02, pushes=(0.5, 0.3), seed=4
+        )
+        machine = run.processes['simulation_node']
+        run.until(lambda machine=machine: machine.poll() is not None)
+        run.until(lambda run=run: len(run.applied) >= 400, 5.0)
+        torques.append(dict(run.applied))
+        assert machine.returncode == 0
+        assert abs(run.states[-1].position[1]) < 0.1
+        stop(run.processes)
+    # An ear may be matched late; what both heard must be the same, and it is nearly all.
+    both = sorted(torques[0].keys() & torques[1].keys())
+    assert len(both) > 300
+    assert [torques[0][t] for t in both] == [torques[1][t] for t in both]
+    assert max(abs(torques[0][t]) for t in both) > 1.0
+
+
+@pytest.mark.parametrize(
+    ('victim', 'by'),
+    [
+        ('observer', signal.SIGKILL),
+        ('balance', signal.SIGKILL),
+        ('safety_gate', signal.SIGKILL),
+        ('observer', signal.SIGSTOP),
+        ('balance', signal.SIGSTOP),
+        ('safety_gate', signal.SIGSTOP),
+    ],
+    ids=[
+        'observer dies', 'controller dies', 'gate dies',
+        'observer hangs', 'controller hangs', 'gate hangs',
+    ],
+)
+def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):
+    # Springs hold the robot up, so that a machine too busy for real time does not end the test.
+    springs = load_experiment('spring_stabilised_inner').setup
+    run = loop(springs, stance='inner', lean=0.0)
+    run.until(lambda: sum(torque != 0.0 for _, torque in run.applied[-40:]) > 20)
+    process = run.processes[victim]
+    process.send_signal(by)
+    # The drive's stamps never run ahead of this clock.
+    gone_ns = time.time_ns()
+    after = gone_ns + STALE_NS + SAMPLE_NS
+    try:
+        run.until(lambda: run.applied[-1][0] > after + 100 * SAMPLE_NS)
+    finally:
+        if by == signal.SIGSTOP:
+            process.kill()
+    late = [torque for stamp, torque in run.applied if stamp > after]
+    assert len(late) > 90
+    assert set(late) == {0.0}

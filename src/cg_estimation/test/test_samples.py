@@ -1,0 +1,85 @@
+"""Messages of one instant become one measurement."""
+
+from cg_estimation.samples import Gatherer
+
+T = 2_000_000
+
+
+def whole(gatherer, k, torque=None):
+    """All parts of sample k, in the order of the machine."""
+    gatherer.add(k * T, {'hip_angle': float(k)})
+    gatherer.add_contact(k * T, 'inner', True)
+    gatherer.add_contact(k * T, 'outer', False)
+    gatherer.add(k * T, {'imu_angle': 0.0, 'imu_rate': 0.0})
+    if torque is not None:
+        gatherer.add_torque(k * T, torque)
+
+
+def test_a_whole_measurement_carries_the_torque_held_before_it():
+    gatherer = Gatherer()
+    whole(gatherer, 1)
+    (first,) = gatherer.due()
+    assert (first.stamp_ns, first.torque, first.stance) == (T, 0.0, 'inner')
+    gatherer.add_torque(T, 3.0)
+    whole(gatherer, 2)
+    (second,) = gatherer.due()
+    assert second.torque == 3.0
+
+
+def test_it_waits_for_the_torque_of_the_interval():
+    gatherer = Gatherer()
+    whole(gatherer, 1, torque=1.0)
+    list(gatherer.due())
+    whole(gatherer, 2)
+    list(gatherer.due())
+    whole(gatherer, 3)
+    # The torque latched at 2 is not known yet.
+    assert list(gatherer.due()) == []
+    gatherer.add_torque(2 * T, 5.0)
+    assert [m.torque for m in gatherer.due()] == [5.0]
+
+
+def test_parts_are_given_out_once_newer_samples_have_come():
+    gatherer = Gatherer()
+    for k in (1, 2, 3):
+        gatherer.add(k * T, {'imu_angle': 0.0})
+    assert [(m.stamp_ns, list(m.outputs)) for m in gatherer.due()] == [(T, ['imu_angle'])]
+
+
+def test_what_is_late_or_repeated_is_not_given_out_again():
+    gatherer = Gatherer()
+    whole(gatherer, 5)
+    list(gatherer.due())
+    whole(gatherer, 5)
+    whole(gatherer, 4)
+    assert list(gatherer.due()) == []
+
+
+def test_without_foot_contacts_the_stance_leg_must_be_told_otherwise():
+    told = Gatherer(contacts=False)
+    told.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+    assert len(list(told.due())) == 1
+    asking = Gatherer()
+    asking.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+    assert list(asking.due()) == []
+
+
+def test_both_feet_down_do_not_tell_which_one_stands():
+    gatherer = Gatherer()
+    gatherer.add_contact(T, 'inner', True)
+    gatherer.add_contact(T, 'outer', True)
+    gatherer.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+    assert [m.stance for m in gatherer.due()] == [None]
+
+
+def test_the_leg_that_lands_stands_from_its_first_touch_on():
+    gatherer = Gatherer()
+    heard = []
+    for k, (inner, outer) in enumerate([(1, 0), (1, 0), (1, 1), (1, 1), (0, 1), (0, 1)], start=1):
+        gatherer.add(k * T, {'imu_angle': 0.0, 'hip_angle': 0.0})
+        gatherer.add_contact(k * T, 'inner', bool(inner))
+        gatherer.add_contact(k * T, 'outer', bool(outer))
+        heard += [m.stance for m in gatherer.due()]
+        gatherer.add_torque(k * T, 0.0)
+    # Both feet down tell nothing new.
+    assert heard == ['inner', 'inner', 'outer', None, 'outer', 'outer']
