@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -168,10 +169,15 @@ def test_controller_balances_follows_and_stops(bench, step):
     bench.until(lambda: node.controller.mode == 'balancing')
     leaning = np.array([0.005, 0.0, 0.0, 0.0])
     assert abs(bench.tell(now + period, leaning)) > 0
+    gain = node.controller.balance.gains['inner'].copy()
+    (result,) = node.set_parameters([Parameter('lean_scale', value=0.2)])
+    assert result.successful
+    bench.tell(now + 2 * period, leaning)
+    assert node.controller.balance.gains['inner'][0] < gain[0]
     bench.order.publish(joint_trajectory(step))
     bench.until(lambda: node.controller.mode == 'tracking')
     # On the nominal motion the answer is the nominal torque.
-    start = now + 2 * period
+    start = now + 3 * period
     for k in range(5):
         stamp, t = start + k * period, k * period * 1e-9
         torque = bench.tell(stamp, step.at(t).state)
@@ -185,8 +191,6 @@ def test_controller_refuses_and_is_safe(bench, robot, step):
     bench.until(lambda: bench.state.get_subscription_count() and node.count_publishers('/state'))
     bench.until(lambda: bench.order.get_subscription_count() >= 2)
     # Another model's trajectory.
-    from dataclasses import replace
-
     bench.text.publish(String(data=replace(step, model_hash='f' * 64).text()))
     bench.until(lambda: 'plan it again' in node.problem)
     bench.tell(1_000_000_000, np.zeros(4))
