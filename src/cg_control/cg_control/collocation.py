@@ -7,6 +7,7 @@ solution starts the fine one. Where a solve from one guess ends in nothing, othe
 differ in durations and in the pose at the impact.
 """
 
+import logging
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,8 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.linearise import DRY_FRICTION
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+
+log = logging.getLogger(__name__)
 
 LARGEST_ANGLE, LARGEST_RATE = 1.5, 30.0  # rad, rad/s: bounds of every state
 JOINT_FRICTION = (*DRY_FRICTION, 'viscous_friction', 'quadratic_friction')
@@ -429,10 +432,15 @@ class Program:
         began = time.perf_counter()
         points = (self.x_lower == self.x_upper).tobytes()
         solver = self.transcription.solver(iterations, tolerance, points)
-        result = solver(
-            x0=self._packed(start), lbx=self.x_lower, ubx=self.x_upper,
-            lbg=self.lower, ubg=self.upper, p=self.p,
-        )  # fmt: skip
+        try:
+            result = solver(
+                x0=self._packed(start), lbx=self.x_lower, ubx=self.x_upper,
+                lbg=self.lower, ubg=self.upper, p=self.p,
+            )  # fmt: skip
+        except RuntimeError as error:  # what the solver throws where it meets no number
+            log.debug('fatrop gave up: %s', error)
+            seconds = time.perf_counter() - began
+            return replace(start, converged=False, violation=math.inf, seconds=seconds)
         seconds = time.perf_counter() - began
         z, g = (np.asarray(result[name]).ravel() for name in ('x', 'g'))
         violation = max(
