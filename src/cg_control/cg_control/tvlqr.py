@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from cg_control.balance import BalanceSettings
 from cg_control.linearise import design_model, linearise_stance
@@ -180,7 +181,8 @@ def riccati(
     constant, linear = flow[:, :, :4].copy(), flow[:, :, 4:].copy()
     for k in range(n - 1, -1, -1):
         XY = constant[k] + linear[k] @ S
-        S = np.linalg.solve(XY[:4].T, XY[4:].T)
+        # LAPACK itself: numpy's checks take longer than four equations.
+        S = dgesv(XY[:4].T, XY[4:].T)[2]
         costs[k] = S = (S + S.T) / 2
     gains = (weight @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
     return gains, costs
