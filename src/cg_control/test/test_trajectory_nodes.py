@@ -17,9 +17,10 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
-from cg_control.collocation import Options, Task  # noqa: E402
+from cg_control.collocation import Options  # noqa: E402
 from cg_control.planning import plan  # noqa: E402
 from cg_control.playback_node import PlaybackNode, Recital  # noqa: E402
+from cg_control.task import Task  # noqa: E402
 from cg_control.trajectory import Trajectory  # noqa: E402
 from cg_control.trajectory_server_node import (  # noqa: E402
     TrajectoryServerNode,

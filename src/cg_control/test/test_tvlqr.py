@@ -5,9 +5,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from cg_control.collocation import Options, Task, optimise, planning_model
+from cg_control.collocation import Options, optimise, planning_model
 from cg_control.linearise import design_model, linearise_stance
 from cg_control.lqr import lqr
+from cg_control.task import Task
 from cg_control.trajectory import Phase, TrajectoryError
 from cg_control.tvlqr import (
     Weights,
