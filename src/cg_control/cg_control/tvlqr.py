@@ -24,13 +24,15 @@ import numpy as np
 from scipy.linalg.lapack import dgesv
 
 from cg_control.balance import BalanceSettings
-from cg_control.linearise import design_model, linearise_stance
+from cg_control.collocation import planning_model
+from cg_control.linearise import linearise_stance
 from cg_control.lqr import Regulator, lqr
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.hybrid import STANCES
 from cg_dynamics.impact import impact_function
+from cg_dynamics.linearise import without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -109,7 +111,8 @@ def stabilise(
 
     Args:
         trajectory: Planned for this model.
-        model: Linearised as its design model: no dry friction, delays and extra states.
+        model: Linearised as it is planned on, less dry friction: what is known of the command path
+            (a weak motor) scales the gains.
         weights: Of deviations.
         final_cost: Q_f, shape (4, 4); None takes that of `balance_regulator` on the last leg.
         saltation: (SALT) at impacts; False takes D alone, as if all robots landed on time.
@@ -125,7 +128,7 @@ def stabilise(
     S = np.array(S, float)
     if S.shape != (4, 4) or not np.allclose(S, S.T):
         raise ValueError(f'final_cost must be a symmetric (4, 4) matrix, got shape {S.shape}')
-    design = design_model(model)
+    design = without_dry_friction(planning_model(model))
     phases: list[Phase] = []
     after: Phase | None = None
     for phase in reversed(trajectory.phases):
