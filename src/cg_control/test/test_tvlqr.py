@@ -156,13 +156,12 @@ def test_trajectory_of_another_model_is_refused(robot, step):
 
 
 def test_a_weak_motor_that_is_known_gets_larger_gains(robot):
-    """Half the torque per command: the same motion wants about twice the gain."""
+    """Half the torque per command wants more gain, and not twice as much: a command costs."""
     weak = robot.with_effect('torque_constant', error=-0.5)
     task = Task(('inner', 'outer'), reach=0.2)
     first, second = (
         stabilise(optimise(model, task, Options(fine=25), friction=False), model)
         for model in (robot, weak)
     )
-    # Not exactly two: the cost of torque counts the command.
-    ratio = second.phases[0].gains[0][0] / first.phases[0].gains[0][0]
-    assert 1.5 < ratio < 2.5
+    # One is a motor that nobody knows of, two the same torque at any price.
+    assert 1.1 < second.phases[0].gains[0][0] / first.phases[0].gains[0][0] < 2.0
