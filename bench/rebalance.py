@@ -22,8 +22,9 @@ import casadi as ca
 import numpy as np
 
 from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.collocation import Options, PlanningError, Task
+from cg_control.collocation import Options, PlanningError
 from cg_control.planning import CheckOptions, executed, plan
+from cg_control.task import Task
 from cg_control.tracking import REMEDIES, TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_description.paths import model_path

@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.collocation import Options, Task
+from cg_control.collocation import Options
 from cg_control.planning import executed, plan
+from cg_control.task import Task
 from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tvlqr import Weights, stabilise

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_control.collocation import Options, PlanningError, Task, optimise, planning_model
+from cg_control.collocation import Options, PlanningError, optimise, planning_model
+from cg_control.task import Task
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tvlqr import Weights, stabilise

@@ -39,10 +39,12 @@ from cg_dynamics.rig import STANCES, Setup
 log = logging.getLogger(__name__)
 
 KNOT = 7  # q (2), v (2), a (2), u
-TORQUE_SCALE = 10.0  # N m; brings (ID) to the size of the other rows
-# Pivot tolerance of fatrop. The rows of a periodic motion are so nearly dependent that with its
-# own 1e-5 it regularises without end; ordinary rows are lost at 1e-3.
-PIVOT = {False: 1e-5, True: 1e-3}
+# Units of the variables: rad, 10 rad/s, 100 rad/s^2, 100 N m. In SI a torque moves an angle within
+# a step by 1e-5, which is fatrop's pivot tolerance: it then takes rows for dependent or, worse,
+# nearly dependent ones for good and regularises without end.
+UNITS = np.array([1.0, 1.0, 10.0, 10.0, 100.0, 100.0, 100.0])
+MEMORY_UNITS = UNITS[:4]
+TORQUE_SCALE = 100.0  # N m; brings (ID) to the size of the other rows
 RATE_SCALE = 100.0  # N m/s
 CLEARANCE_WIDTH = 0.01  # m of reach over which a retracted foot comes down
 TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
@@ -146,6 +148,7 @@ class Transcription:
     Attributes:
         structure: What it was made for.
         parameter_count: Length of the parameter vector: model, task, region.
+        units: Of the state of a stage, shape (nx,); its control is in UNITS.
         names: Name of each row of g, '' for the dynamics of stages.
         lower: Bounds of the rows of g; those of inequalities are set by the task.
         upper: As `lower`.
@@ -157,6 +160,7 @@ class Transcription:
         self.structure = structure
         self.memory = 4 if structure.periodic else 0
         self.nx = KNOT + 1 + self.memory
+        self.units = np.concatenate([UNITS, [1.0], MEMORY_UNITS[: self.memory]])
         self.model_parameters = len(parameter_names(model, Setup()))
         goal = GOAL_PARAMETERS['region' if structure.region else 'box']
         self.parameter_count = self.model_parameters + len(TASK_PARAMETERS) + goal
@@ -173,6 +177,10 @@ class Transcription:
             zip(TASK_PARAMETERS, ca.vertsplit(task[: len(TASK_PARAMETERS)]), strict=True)
         )
         return self._symbols[: self.model_parameters], named
+
+    def _physical(self, scaled: Any) -> Any:
+        """The state of a stage in SI units."""
+        return ca.DM(self.units) * scaled
 
     def _inverse_dynamics(self, mode: str):
         e = assemble(self._model, Setup(stance=mode))
@@ -196,7 +204,8 @@ class Transcription:
         return height, ca.jtimes(height, q, v), reach
 
     def _stage(self, mode: str, n: int, first: bool) -> Block:
-        s, w = ca.SX.sym('s', self.nx), ca.SX.sym('w', KNOT)
+        scaled = ca.SX.sym('z', self.nx + KNOT)
+        s, w = self._physical(scaled[: self.nx]), ca.DM(UNITS) * scaled[self.nx :]
         p, task = self._parameters()
         dynamics = self._inverse_dynamics(mode)
         x, a, u, T = s[:4], s[4:6], s[6], s[7]
@@ -215,7 +224,7 @@ class Transcription:
         if first:
             rows.append(('dynamics', dynamics(x, a, u, p), 0.0, 0.0))
             if self.memory:
-                rows.append(('memory', s[8:] - x, 0.0, 0.0))
+                rows.append(('memory', (s[8:] - x) / MEMORY_UNITS, 0.0, 0.0))
         if self.structure.rate_limited:
             rows.append(('rate', (u_next - u) / h / RATE_SCALE, np.nan, np.nan))
         if self.structure.clearance:
@@ -227,7 +236,7 @@ class Transcription:
         effort = h / 2 * (u**2 + u_next**2)
         cost = task['effort'] * effort + task['time'] * h
         kind = 'first' if first else 'stage'
-        return _block(f'{kind}_{mode}', ca.vertcat(s, w), self._symbols, rows, cost)
+        return _block(f'{kind}_{mode}', scaled, self._symbols, rows, cost)
 
     def _landing(self, s: ca.SX, mode: str):
         q, v = ca.SX.sym('q', 2), ca.SX.sym('v', 2)
@@ -248,7 +257,9 @@ class Transcription:
 
     def _jump(self, mode: str) -> Block:
         # Control: what is new after the impact, (a, u, T).
-        s, w = ca.SX.sym('s', self.nx), ca.SX.sym('w', 4)
+        scaled = ca.SX.sym('z', self.nx + 4)
+        s = self._physical(scaled[: self.nx])
+        w = ca.DM([*UNITS[4:], 1.0]) * scaled[self.nx :]
         p, _ = self._parameters()
         v_plus, rows, miss = self._landing(s, mode)
         after = self._inverse_dynamics(other(mode))(
@@ -256,12 +267,15 @@ class Transcription:
         )
         rows.append(('dynamics', after, 0.0, 0.0))
         # The next state enters linearly; the rows of the gap come first and hold it back.
-        gap = ca.vertcat(s[:2], v_plus, w, s[8:])
+        gap = ca.vertcat(
+            s[:2], v_plus / UNITS[2:4], scaled[self.nx :], scaled[8 : self.nx]
+        )
         rows = [('', gap, 0.0, 0.0), *rows]
-        return _block(f'jump_{mode}', ca.vertcat(s, w), self._symbols, rows, miss)
+        return _block(f'jump_{mode}', scaled, self._symbols, rows, miss)
 
     def _last(self, mode: str) -> Block:
-        s = ca.SX.sym('s', self.nx)
+        scaled = ca.SX.sym('z', self.nx)
+        s = self._physical(scaled)
         rows: list[Row] = []
         miss: Any = 0
         self._parameters()
@@ -272,7 +286,7 @@ class Transcription:
             if self.structure.elastic:
                 miss += ca.sumsqr((image - s[8:]) / MISS_SCALE)
             else:
-                rows.append(('periodicity', image - s[8:], 0.0, 0.0))
+                rows.append(('periodicity', (image - s[8:]) / MEMORY_UNITS, 0.0, 0.0))
         if self.structure.region:
             e = s[:4] - self._goal[:4]
             form = ca.dot(e, ca.mtimes(ca.reshape(self._goal[4:], 4, 4), e))
@@ -283,7 +297,7 @@ class Transcription:
         elif self.structure.elastic:
             below, above = self._goal[:4] - s[:4], s[:4] - self._goal[4:]
             miss += ca.sumsqr(ca.fmax(ca.fmax(below, above), 0) / MISS_SCALE)
-        return _block(f'last_{mode}', s, self._symbols, rows, miss)
+        return _block(f'last_{mode}', scaled, self._symbols, rows, miss)
 
     # The program
 
@@ -463,7 +477,6 @@ class Transcription:
                     'equality': equality, 'error_on_fail': False,
                     'fatrop': {
                         'print_level': 0, 'max_iter': iterations, 'tol': tolerance,
-                        'linsol_lu_fact_tol': PIVOT[self.structure.periodic],
                     },
                 },
             )  # fmt: skip

@@ -21,16 +21,18 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.linalg.lapack import dgesv
 
 from cg_control.balance import BalanceSettings
-from cg_control.linearise import design_model, linearise_stance
+from cg_control.collocation import planning_model
+from cg_control.linearise import linearise_stance
 from cg_control.lqr import Regulator, lqr
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.hybrid import STANCES
 from cg_dynamics.impact import impact_function
-from cg_dynamics.linearise import jacobians
+from cg_dynamics.linearise import without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -109,7 +111,8 @@ def stabilise(
 
     Args:
         trajectory: Planned for this model.
-        model: Linearised as its design model: no dry friction, delays and extra states.
+        model: Linearised as it is planned on, less dry friction: what is known of the command path
+            (a weak motor) scales the gains.
         weights: Of deviations.
         final_cost: Q_f, shape (4, 4); None takes that of `balance_regulator` on the last leg.
         saltation: (SALT) at impacts; False takes D alone, as if all robots landed on time.
@@ -125,7 +128,7 @@ def stabilise(
     S = np.array(S, float)
     if S.shape != (4, 4) or not np.allclose(S, S.T):
         raise ValueError(f'final_cost must be a symmetric (4, 4) matrix, got shape {S.shape}')
-    design = design_model(model)
+    design = without_dry_friction(planning_model(model))
     phases: list[Phase] = []
     after: Phase | None = None
     for phase in reversed(trajectory.phases):
@@ -178,11 +181,12 @@ def riccati(
     flow = exponentials(-omega)
     costs = np.empty((n + 1, 4, 4))
     costs[n] = S
+    constant, linear = flow[:, :, :4].copy(), flow[:, :, 4:].copy()
     for k in range(n - 1, -1, -1):
-        XY = flow[k, :, :4] + flow[k, :, 4:] @ S
-        S = np.linalg.solve(XY[:4].T, XY[4:].T)
-        S = (S + S.T) / 2
-        costs[k] = S
+        XY = constant[k] + linear[k] @ S
+        # LAPACK itself: numpy's checks take longer than four equations.
+        S = dgesv(XY[:4].T, XY[4:].T)[2]
+        costs[k] = S = (S + S.T) / 2
     gains = (weight @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
     return gains, costs
 
@@ -202,7 +206,7 @@ def linearised(
     """A (n, 4, 4) and B (n, 4, 1) at n states (n, 4) and torques (n,)."""
     setup = Setup(stance=stance)
     function = _mapped(compile_model(design, setup), len(x))
-    A, B = function(x.T, u[None, :], parameter_vector(design, setup))[:2]
+    A, B = function(x.T, u[None, :], parameter_vector(design, setup))
     n = len(x)
     # Columns stand side by side, one state's matrix after the other.
     A = np.asarray(A).reshape(4, n, 4).transpose(1, 0, 2)
@@ -211,10 +215,12 @@ def linearised(
 
 @functools.cache
 def _mapped(compiled: CompiledModel, n: int) -> ca.Function:
-    x, u, p = (ca.MX.sym(s, m, k) for s, m, k in (
-        ('x', compiled.nx, n), ('u', compiled.nu, n), ('p', compiled.np, 1),
-    ))  # fmt: skip
-    A, B = jacobians(compiled).map(n)(x, u, ca.repmat(p, 1, n))[:2]
+    e = compiled.equations
+    by_x, by_u = ca.jacobian(e.rates, e.x), ca.jacobian(e.rates, e.u)
+    dense = list(ca.cse([ca.densify(by_x), ca.densify(by_u)]))
+    x, u = ca.MX.sym('x', compiled.nx, n), ca.MX.sym('u', compiled.nu, n)
+    p = ca.MX.sym('p', compiled.np)
+    A, B = ca.Function('AB', [e.x, e.u, e.p], dense).map(n)(x, u, ca.repmat(p, 1, n))
     return ca.Function('along', [x, u, p], [A, B])
 
 

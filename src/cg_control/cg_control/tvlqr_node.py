@@ -6,6 +6,7 @@ on which that ends. What it follows is the text on /trajectory/selected; when, i
 stamp, zero torque included, so that the same node works in real time and in lock-step.
 """
 
+import dataclasses
 import json
 import math
 import time
@@ -13,12 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from cg_control.balance import BALANCING, BalanceController, balance_gains
+from cg_control.balance import BALANCING, WEIGHTS, BalanceController, balance_gains
+from cg_control.basin import shipped_basins
 from cg_control.execution import CAUGHT, TRACKING, ExecutionSettings, TrajectoryController
 from cg_control.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
@@ -61,8 +64,9 @@ class TvlqrNode(Node):
         self.declared = DeclaredSettings(self, TvlqrNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
         self.model = Model.load(settings.model_file or model_path(NOMINAL_MODEL))
-        gains = balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz)
+        gains = self._gains(settings)
         balance = BalanceController(self.model, settings, gains)
+        balance.basins = shipped_basins(self.model, gains, balance.torque_limit)
         self.controller = TrajectoryController(balance, self.model, settings)
         self.trajectory: Trajectory | None = None
         self.problem = 'no trajectory selected yet'
@@ -81,7 +85,31 @@ class TvlqrNode(Node):
             String, '/trajectory/selected', self.on_selected, LATCHED_QOS
         )
         self.create_subscription(JointTrajectory, '/trajectory', self.on_order, SENSOR_QOS)
+        self.add_on_set_parameters_callback(self._judge)
         self.started = True
+
+    def _gains(self, settings: TvlqrNodeSettings) -> dict[str, np.ndarray]:
+        return balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz)
+
+    def _judge(self, parameters: list) -> SetParametersResult:
+        """Refuse settings for which there is no regulator."""
+        changes = {p.name: p.value for p in parameters if p.name in WEIGHTS}
+        try:
+            self._gains(dataclasses.replace(self.declared.values, **changes))
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _adopt(self, settings: TvlqrNodeSettings) -> None:
+        """Take over what `ros2 param set` has changed."""
+        before, self._adopted = self._adopted, settings
+        gains = None
+        if any(getattr(settings, name) != getattr(before, name) for name in WEIGHTS):
+            gains = self._gains(settings)
+            # The basin is that of the shipped gains; with others nobody has sampled one here.
+            limit = self.controller.balance.torque_limit
+            self.controller.balance.basins = shipped_basins(self.model, gains, limit)
+        self.controller.adopt(settings, gains)
 
     def on_selected(self, message: String) -> None:
         """Take over the selected trajectory, if it is this robot's."""
@@ -129,8 +157,7 @@ class TvlqrNode(Node):
             self.controller.interrupt()
         self._last_ns = stamp_ns
         if self._adopted is not self.declared.values:
-            self._adopted = self.declared.values
-            self.controller.adopt(self._adopted)
+            self._adopt(self.declared.values)
         try:
             stance, x = state_of(message)
         except ValueError as error:

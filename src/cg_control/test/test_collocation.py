@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from cg_control.collocation import (
-    Box,
-    Ellipsoid,
     InfeasibleError,
     Options,
-    Task,
     UndecidedError,
     optimise,
     planning_model,
     screen,
 )
+from cg_control.task import Box, Ellipsoid, Task
 from cg_dynamics.gait import find_gait
 from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from cg_control.collocation import Options, Task
+from cg_control.collocation import Options
 from cg_control.cost_tuning import Trial, draw, score, search, starts
 from cg_control.planning import plan
+from cg_control.task import Task
 from cg_control.tvlqr import Weights
 
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control.collocation import Options, Task
+from cg_control.collocation import Options
 from cg_control.planning import CheckOptions, RejectedError, check, executed, plan
+from cg_control.task import Task
 from cg_control.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import TrajectoryError
 from cg_dynamics.hybrid import WalkOptions

@@ -2,6 +2,7 @@
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
-from cg_control.collocation import Options, Task  # noqa: E402
+from cg_control.collocation import Options  # noqa: E402
 from cg_control.planning import plan  # noqa: E402
 from cg_control.playback_node import PlaybackNode, Recital  # noqa: E402
+from cg_control.task import Task  # noqa: E402
 from cg_control.trajectory import Trajectory  # noqa: E402
 from cg_control.trajectory_server_node import (  # noqa: E402
     TrajectoryServerNode,
@@ -168,10 +170,15 @@ def test_controller_balances_follows_and_stops(bench, step):
     bench.until(lambda: node.controller.mode == 'balancing')
     leaning = np.array([0.005, 0.0, 0.0, 0.0])
     assert abs(bench.tell(now + period, leaning)) > 0
+    gain = node.controller.balance.gains['inner'].copy()
+    (result,) = node.set_parameters([Parameter('lean_scale', value=0.2)])
+    assert result.successful
+    bench.tell(now + 2 * period, leaning)
+    assert node.controller.balance.gains['inner'][0] < gain[0]
     bench.order.publish(joint_trajectory(step))
     bench.until(lambda: node.controller.mode == 'tracking')
     # On the nominal motion the answer is the nominal torque.
-    start = now + 2 * period
+    start = now + 3 * period
     for k in range(5):
         stamp, t = start + k * period, k * period * 1e-9
         torque = bench.tell(stamp, step.at(t).state)
@@ -185,8 +192,6 @@ def test_controller_refuses_and_is_safe(bench, robot, step):
     bench.until(lambda: bench.state.get_subscription_count() and node.count_publishers('/state'))
     bench.until(lambda: bench.order.get_subscription_count() >= 2)
     # Another model's trajectory.
-    from dataclasses import replace
-
     bench.text.publish(String(data=replace(step, model_hash='f' * 64).text()))
     bench.until(lambda: 'plan it again' in node.problem)
     bench.tell(1_000_000_000, np.zeros(4))

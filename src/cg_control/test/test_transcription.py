@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cg_control.collocation import planning_model
-from cg_control.transcription import Structure, transcribe
+from cg_control.transcription import UNITS, Structure, transcribe
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.impact import impact
@@ -81,9 +81,9 @@ def test_rows_vanish_on_a_motion_of_the_model_as_the_step_shrinks(robot):
         knots = np.column_stack([x, a, torque])
         z = np.zeros(program.size)
         for k in range(n + 1):
-            z[program.offsets[k] : program.offsets[k] + 8] = [*knots[k], 0.6]
+            z[program.offsets[k] : program.offsets[k] + 8] = [*knots[k] / UNITS, 0.6]
             if k < n:
-                z[program.offsets[k] + 8 : program.offsets[k + 1]] = knots[k + 1]
+                z[program.offsets[k] + 8 : program.offsets[k + 1]] = knots[k + 1] / UNITS
         g = np.array(program.functions()['nlp_g'](z, p)).ravel()
         np.testing.assert_allclose(g[program.rows_of['']], 0.0, atol=1e-14)
         # Rounding of accelerations of 10 rad/s^2, and the 0.1 ms steps of the simulation.
@@ -100,9 +100,9 @@ def test_phases_are_joined_by_the_impact_map(robot):
     x = np.array([0.2, -0.2, 0.9, 0.4])
     z = np.zeros(program.size)
     at = program.offsets[2]
-    z[at : at + 4] = x
+    z[at : at + 4] = x / UNITS[:4]
     after = impact(model, 'inner', x).x_plus
-    z[program.offsets[3] : program.offsets[3] + 4] = after
+    z[program.offsets[3] : program.offsets[3] + 4] = after / UNITS[:4]
     g = np.array(program.functions()['nlp_g'](z, parameters(model, program.structure))).ravel()
     first = program.rows_of['landing'][0]
     # The gap to the next phase stands right before the landing row. Feet at one height are above

@@ -5,9 +5,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from cg_control.collocation import Options, Task, optimise, planning_model
+from cg_control.collocation import Options, optimise, planning_model
 from cg_control.linearise import design_model, linearise_stance
 from cg_control.lqr import lqr
+from cg_control.task import Task
 from cg_control.trajectory import Phase, TrajectoryError
 from cg_control.tvlqr import (
     Weights,
@@ -152,3 +153,15 @@ def test_trajectory_of_another_model_is_refused(robot, step):
         stabilise(step, robot, final_cost=np.eye(3))
     with pytest.raises(ValueError, match='torque is 0'):
         Weights(torque=0.0)
+
+
+def test_a_weak_motor_that_is_known_gets_larger_gains(robot):
+    """Half the torque per command wants more gain, and not twice as much: a command costs."""
+    weak = robot.with_effect('torque_constant', error=-0.5)
+    task = Task(('inner', 'outer'), reach=0.2)
+    first, second = (
+        stabilise(optimise(model, task, Options(fine=25), friction=False), model)
+        for model in (robot, weak)
+    )
+    # One is a motor that nobody knows of, two the same torque at any price.
+    assert 1.1 < second.phases[0].gains[0][0] / first.phases[0].gains[0][0] < 2.0

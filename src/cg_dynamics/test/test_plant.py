@@ -1,4 +1,4 @@
-"""The simulated machine: a push at the hip, and walking off its blocks."""
+"""The simulated machine: a push at the hip is an impulse; off its blocks it walks."""
 
 import numpy as np
 import pytest
