@@ -407,7 +407,14 @@ class SimulationNode(LifecycleNode):
             self._fail('a recorder did not store the last sample')
         elif not behind:
             seconds = time.monotonic() - self._begun
-            self.get_logger().info(f'run is complete: {self.ticks} samples in {seconds:.3f} s')
+            outputs = self.plant.measure().outputs if self.plant else {}
+            where = ', '.join(
+                f'{channel} {value:.3f} rad' for channel, value in outputs.items()
+                if channel.endswith('angle')
+            )  # fmt: skip
+            self.get_logger().info(
+                f'run is complete: {self.ticks} samples in {seconds:.3f} s; at the end {where}'
+            )
             self.phase = 'off'
             self.trigger_deactivate()
             self.finished = self.settings.exit_when_done
