@@ -270,8 +270,11 @@ def draw(record: Record, paths: Sequence[Response], found, target: Path) -> None
 
     figure = Figure(figsize=(9, 9), layout='constrained')
     size, coherent, trace = figure.subplots(3, 1)
+    # Below what the torque excites there is nothing to see: no sensor follows it there.
+    heard = np.max([path.coherence for path in paths], axis=0) > COHERENT
+    lowest = min(paths[0].frequency[heard], default=0.0)
     for path in paths:
-        shown = path.frequency <= 2 * BAND[1]
+        shown = (path.frequency >= lowest) & (path.frequency <= 2 * BAND[1])
         f, A = path.frequency[shown], np.abs(path.acceleration[shown])
         spread = CONFIDENCE * (path.sigma / np.abs(path.H))[shown] * A
         (line,) = size.loglog(f, A, label=path.channel)
@@ -285,6 +288,11 @@ def draw(record: Record, paths: Sequence[Response], found, target: Path) -> None
         trace.plot(time, level / level.max(), color=line.get_color())
     size.set(ylabel='acceleration per torque, rad/s²/(N m)', title=record.name)
     size.legend()
+    for axes in (size, coherent):
+        axes.xaxis.set_major_formatter('{x:g}')
+        axes.xaxis.set_minor_formatter('{x:g}')
+        axes.tick_params(axis='x', which='minor', labelsize=7)
+        axes.grid(which='both', alpha=0.2)
     coherent.set(xlabel='frequency, Hz', ylabel='coherence', ylim=(0, 1.02))
     trace.set(xlabel='time, s', ylabel='high-pass, abs, low-pass; of its largest')
     figure.savefig(target, dpi=120)
