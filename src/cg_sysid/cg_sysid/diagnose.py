@@ -185,18 +185,18 @@ class _Search:
         """Accept one effect after the other, until nothing more is earned."""
         while len(self._added(o)) < self.options.rounds:
             plain, o = o, self._with_small_faults(o)
-            if settled(o):
-                cause = self._rather_one_cause(plain, o)
-                if cause is None:
-                    break
-                o = cause
+            winner = None
+            if not settled(o):
+                contest = self._contest(o)
+                winner = contest.winner()
+                self._note(contest, winner[0].label if winner else '')
+            if winner is not None:
+                o = self._refitted(winner[1])
                 continue
-            contest = self._contest(o)
-            winner = contest.winner()
-            self._note(contest, winner[0].label if winner else '')
-            if winner is None:
+            cause = self._rather_one_cause(plain, o)
+            if cause is None:
                 break
-            o = self._refitted(winner[1])
+            o = cause
         return o
 
     def _refitted(self, o: Outcome) -> Outcome:
@@ -228,7 +228,7 @@ class _Search:
 
         Together they can imitate much, but hardly down to the last of it.
         """
-        if settled(plain):
+        if faulty is plain or settled(plain):
             return None
         contest = self._contest(plain)
         winner = contest.winner()
