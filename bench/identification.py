@@ -103,7 +103,7 @@ def _compiled_states(compiled, trial, motion, p):
 
 
 def _solve_ivp_states(compiled, trial, motion, p):
-    """The way of the seed text: a general-purpose integrator around a Python right-hand side."""
+    """The way of the thesis: a general-purpose integrator around a Python right-hand side."""
     step = trial.time[1] - trial.time[0]
 
     def rates(t, x):

@@ -53,7 +53,7 @@ def planning_model(model: Model, friction: bool = True) -> Model:
     Args:
         model: The robot.
         friction: Keep what the joints rub. Without it a controller has to add it, as the
-            friction compensator of the seed does.
+            friction compensator of the thesis does.
     """
     for effect in model.effects:
         if (

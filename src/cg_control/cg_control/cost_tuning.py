@@ -1,10 +1,10 @@
-"""Cost tuning (the seed's 4.5): which weights give a trajectory the largest basin of attraction?
+"""Cost tuning (thesis, 4.5): which weights give a trajectory the largest basin of attraction?
 
     python -m cg_control.cost_tuning --rounds 12 --out tuning      searches, draws, prints
 
 A set of weights is scored by simulation: the share of seeded starts around the start of the
 trajectory from which the exact hybrid model, friction and torque limit included, ends standing.
-The search is design intuition plus brute force, as the seed says: it begins with the weights of
+The search is design intuition plus brute force, as the thesis says: it begins with the weights of
 the balance controller, changes them by random factors on a logarithmic scale that become
 smaller, and keeps what scores better. Starts are the same for all, so that scores compare.
 """

@@ -1,4 +1,4 @@
-"""ROS node that plays a nominal torque back, open loop (the seed's Fig. 4-2 and 4-6).
+"""ROS node that plays a nominal torque back, open loop (the thesis's Fig. 4-2 and 4-6).
 
 Each measurement is answered by the torque of its stamp: the first one after a motion came on
 /trajectory is its time zero. Before, after, and when an empty motion stops it, the torque is zero.

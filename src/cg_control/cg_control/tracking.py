@@ -1,10 +1,10 @@
 """Following a trajectory: u = u0(s) - K(s) (x - x0(s)), and what happens around an impact.
 
-The clock of TVLQR is its weakness (the seed's 4.5): gains and reference belong to an instant, and
+The clock of TVLQR is its weakness (thesis, 4.5): gains and reference belong to an instant, and
 if the robot lands earlier or later they belong to the wrong leg. The remedies differ in s:
 
     clock   s = t, whatever leg stands: the plain controller; it can meet positive feedback
-    blank   s = t, no feedback within `window` of a nominal impact: the seed's remedy
+    blank   s = t, no feedback within `window` of a nominal impact: the thesis's remedy
     event   the phase is that of the leg that stands; at the impact s jumps to the nominal one.
             Until a late impact the reference goes on as the model would
     phase   as event, and s follows the robot: it runs faster or slower towards the point of the

@@ -1,6 +1,6 @@
 """Direct collocation of a hybrid motion as a sparse program, compiled once per structure.
 
-Hermite-Simpson as in Hargraves and Paris 1987 (the seed's "DIRCOL"): with knots k, step h = T/n,
+Hermite-Simpson as in Hargraves and Paris 1987 (the thesis's "DIRCOL"): with knots k, step h = T/n,
 rates r = (v, a) and the slope and value of the cubic at the middle of an interval,
 
     x_c = (x + x+)/2 + h/8 (r - r+),   a_c = 3/(2h) (v+ - v) - (a + a+)/4          (HS)

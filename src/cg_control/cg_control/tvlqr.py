@@ -1,4 +1,4 @@
-"""Time-varying linear-quadratic regulation along a hybrid trajectory (the seed's 4.5).
+"""Time-varying linear-quadratic regulation along a hybrid trajectory (thesis, 4.5).
 
     min int (x'Q x + u'R u) dt + x(T)'Q_f x(T),   dx/dt = A(t) x + B(t) u  (deviations)
     -dS/dt = Q + S A + A'S - S B R^-1 B'S,  S(T) = Q_f,   u = u0 - K (x - x0),  K = R^-1 B'S  (RIC)
@@ -46,7 +46,7 @@ class Weights:
     The defaults are, rounded, those of the balance controller.
 
     Attributes:
-        stance_angle: 1/rad^2. The highest, says the seed: it decides who still stands.
+        stance_angle: 1/rad^2. The highest, says the thesis: it decides who still stands.
         swing_angle: 1/rad^2. The second.
         stance_rate: s^2/rad^2. Far below.
         swing_rate: s^2/rad^2. Far below.

@@ -8,5 +8,5 @@ from cg_dynamics.model import Model
 
 @pytest.fixture(scope='session')
 def robot() -> Model:
-    """The robot of the seed text, friction included."""
+    """The robot of the thesis, friction included."""
     return Model.load(model_path('compass_gait_mit'))

@@ -20,7 +20,7 @@ def step(robot):
 def test_score_counts_who_stands_and_bad_weights_lose(robot, step):
     deviations = starts(8, 'inner') * 0.6
     good = score(step, robot, Weights(), deviations)
-    # All states weighted alike, hardly any torque: what the seed warns of.
+    # All states weighted alike, hardly any torque: what the thesis warns of.
     bad = score(step, robot, Weights(1, 1, 1, 1, 100.0, 1e-6), deviations)
     assert good >= 0.75
     assert bad <= good - 0.25

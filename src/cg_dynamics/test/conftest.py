@@ -15,7 +15,7 @@ SPRINGS = (
 
 @pytest.fixture
 def robot() -> Model:
-    """The robot of the seed text, friction included."""
+    """The robot of the thesis, friction included."""
     return Model.load(model_path('compass_gait_mit'))
 
 

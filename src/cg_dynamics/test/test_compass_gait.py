@@ -1,4 +1,4 @@
-"""The compass gait against the seed text, term by term, and against laws of mechanics."""
+"""The compass gait against the thesis, term by term, and against laws of mechanics."""
 
 import casadi as ca
 import numpy as np

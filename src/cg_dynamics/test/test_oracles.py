@@ -1,7 +1,7 @@
 """The same motions in two engines that share nothing with this package: Drake and MuJoCo.
 
 The hip body bisects the legs, which neither engine can express as a plain joint; here it is as
-good as massless, and test_compass_gait.py checks its terms against the seed text.
+good as massless, and test_compass_gait.py checks its terms against the thesis.
 """
 
 import importlib

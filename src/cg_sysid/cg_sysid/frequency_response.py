@@ -13,7 +13,7 @@ resonance is a peak of it where the coherence gamma^2 is high. It is fitted by
     -omega^2 H = exp(-s tau) (r + c / (1 + 2 zeta s / w0 + s^2 / w0^2)),  s = i omega  (RES)
 
 The encoder tells apart what a single sensor cannot: a transmission that bends shows in it, a bent
-bracket of the IMU shows in the IMU alone. The seed's own picture (Fig. 4-12, 4-13), the magnitude
+bracket of the IMU shows in the IMU alone. The thesis' picture (Fig. 4-12, 4-13), the magnitude
 of a signal over time by high-pass, absolute value and low-pass, is `magnitude_trace`.
 """
 
@@ -241,7 +241,7 @@ def flexible_start(model: Model, setup: Setup, found: Resonance) -> Model:
 def magnitude_trace(
     signal: np.ndarray, sample_time: float, high_pass: float = 5.0, low_pass: float = 1.0
 ) -> np.ndarray:
-    """The seed's trace of a signal's high-frequency magnitude: high-pass, abs, low-pass.
+    """The thesis's trace of a signal's high-frequency magnitude: high-pass, abs, low-pass.
 
     Args:
         signal: Samples, shape (n,).

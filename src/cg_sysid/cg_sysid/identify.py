@@ -7,7 +7,7 @@ Newton with exact sensitivities and Levenberg-Marquardt damping; each record's o
 eliminated by a Schur complement, so that many records cost no more than their simulation.
 
 Two things make it robust. The horizon grows from a fraction of a second to the whole record, so
-that the cliffs of the full cost (seed text, 4.2.3) are met only near the solution. And the weight
+that the cliffs of the full cost (thesis, 4.2.3) are met only near the solution. And the weight
 W follows the residual that is left, so that a wrong model does not buy a small gain in fit with
 parameters far outside what the model file believes.
 """

@@ -8,7 +8,7 @@ d(a) = (sin a, cos a) the direction of a body that leans by a, l the leg length 
                    - dh/dt . (c4 d'(q1) w1 + c5 d'(q2) w2 - 2 c6 d'(q3) (w1 + w2)) / l   (CG2)
     V / (mt g)   = up . (h - c4 l d(q1) - c5 l d(q2) + 4 c6 l d(q3)),  q3 = (q1 + q2)/2   (CG3)
 
-which gives Eq. 4.4 to 4.6 of the seed text when leg 1 (inner) is stance, and the same with
+which gives Eq. 4.4 to 4.6 of the thesis when leg 1 (inner) is stance, and the same with
 c1 <-> c2, c4 <-> c5 when leg 2 is.
 """
 
