@@ -139,6 +139,25 @@ def stop(processes: dict[str, subprocess.Popen]) -> None:
             process.wait()
 
 
+def carry_out(nodes: dict[str, NodeOf]) -> int:
+    """Exit code of the machine, `simulation_node`; 1 if another node ended before it."""
+    with tempfile.TemporaryDirectory(prefix='cg_run_') as directory:
+        processes = start(nodes, Path(directory))
+        machine = processes['simulation_node']
+        try:
+            while machine.poll() is None:
+                for name, process in processes.items():
+                    if process is not machine and process.poll() is not None:
+                        print(f'error: {name} ended early', file=sys.stderr)
+                        return 1
+                time.sleep(POLL)
+            return machine.returncode
+        except KeyboardInterrupt:
+            return 130
+        finally:
+            stop(processes)
+
+
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_bringup balance`."""
     default = BalanceOptions()
@@ -156,21 +175,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--method', default='high_gain', help='of the observer [high_gain]')
     parser.add_argument('--epsilon', type=float, default=0.2, help='of the observer, s [0.2]')
     options = BalanceOptions(**vars(parser.parse_args(args)))
-    with tempfile.TemporaryDirectory(prefix='cg_balance_') as directory:
-        processes = start(balance_nodes(options), Path(directory))
-        machine = processes['simulation_node']
-        try:
-            while machine.poll() is None:
-                for name, process in processes.items():
-                    if process is not machine and process.poll() is not None:
-                        print(f'error: {name} ended early', file=sys.stderr)
-                        return 1
-                time.sleep(POLL)
-            return machine.returncode
-        except KeyboardInterrupt:
-            return 130
-        finally:
-            stop(processes)
+    return carry_out(balance_nodes(options))
 
 
 if __name__ == '__main__':

@@ -7,16 +7,12 @@ server, the TVLQR controller and the safety gate as processes of their own, for 
 """
 
 import argparse
-import sys
-import tempfile
-import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from cg_bringup.balance_run import POLL, NodeOf, start, stop
+from cg_bringup.balance_run import NodeOf, carry_out
 from cg_bringup.runs import MODES
 from cg_control.tracking import REMEDIES
 from cg_description.paths import model_path
@@ -112,21 +108,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--seed', type=int, default=1, help='of the sensor noise [1]')
     parser.add_argument('--duration', type=float, default=6.0, help='in s, 0 for ever [6]')
     options = RebalanceOptions(**vars(parser.parse_args(args)))
-    with tempfile.TemporaryDirectory(prefix='cg_rebalance_') as directory:
-        processes = start(rebalance_nodes(options), Path(directory))
-        machine = processes['simulation_node']
-        try:
-            while machine.poll() is None:
-                for name, process in processes.items():
-                    if process is not machine and process.poll() is not None:
-                        print(f'error: {name} ended early', file=sys.stderr)
-                        return 1
-                time.sleep(POLL)
-            return machine.returncode
-        except KeyboardInterrupt:
-            return 130
-        finally:
-            stop(processes)
+    return carry_out(rebalance_nodes(options))
 
 
 if __name__ == '__main__':

@@ -16,6 +16,7 @@ here, by their stamps alone:
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -99,7 +100,7 @@ class Phase:
         return np.asarray(self.compiled.h(x, u, self.p)).ravel()
 
 
-class StampedEstimator:
+class StampedEstimator(ABC):
     """Base of the estimators: deals with stamps, absent channels, gaps and landings.
 
     A subclass moves `self._x` on in `_predict` and weighs a measurement in `_correct`.
@@ -174,17 +175,17 @@ class StampedEstimator:
         self._estimate = Estimate(stamp_ns, self.stance, self._x.copy(), running, blind)
         return self._estimate
 
+    @abstractmethod
     def _begin(self, motion: np.ndarray, torque: float) -> None:
         """Set `self._x` from measured angles and first guesses of the rates, shape (4,)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _predict(self, duration: float, torque: float) -> None:
         """Move `self._x` on by `duration` s during which the drive held `torque`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _correct(self, y: np.ndarray, duration: float) -> None:
         """Weigh readings, shape (ny,), NaN where absent, `duration` s after the last ones."""
-        raise NotImplementedError
 
     def _land(self, stance: str) -> None:
         """The swing foot has landed and is stance now."""
