@@ -1,7 +1,8 @@
 """How often the right cause is named: effects hidden in simulated machines, many sizes and seeds.
 
     ./cg exec python bench/hidden_effects.py [--first 101] [--seeds 1] [--effects a,b]
-        [--sizes 1,0.3] [--faults] [--pairs N] [--raw FILE] [--write FILE] [--picture FILE]
+        [--sizes 1,0.3] [--faults] [--pairs N] [--workers N] [--raw FILE]
+        [--write FILE] [--picture FILE]
 
 Each case: an effect of a size drawn from cg_bringup/config/hidden_effects.yaml, times one of
 `--sizes`, is put into a robot whose numbers are 10 to 20 % off the nominal file; the four
@@ -12,7 +13,8 @@ that turns twice as fast, springs 1 % off, an encoder 0.3 mrad off. `--pairs` hi
 
 A case is *exact* if causes and rivals together are what was hidden, *top* if the causes are, and
 *found* if what was hidden is among causes and rivals. Every case is one line of `--raw`, and the
-table is made from all lines there: long runs can be done in pieces.
+table is made from all lines there: long runs can be done in pieces, and beside each other with
+`--workers 1` each.
 """
 
 import argparse
@@ -31,7 +33,7 @@ from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import effect_name
+from cg_sysid.diagnosis import Options, effect_name
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
 from cg_sysid.rehearse import rehearse
@@ -46,12 +48,12 @@ SECONDS = 8.0
 SHARE = 3.0  # of the noise: causes that explain less are not counted as hidden
 
 
-def records_of(machine, seed, spring_error=0.0):
-    """The eight records of one machine; their notes do not know of the springs' error."""
+def records_of(machine, seed, spring_error=0.0, programme=PROGRAMME, seconds=SECONDS):
+    """The records of one machine; their notes do not know of the springs' error."""
     found = []
-    for i, name in enumerate(PROGRAMME):
+    for i, name in enumerate(programme):
         e = load_experiment(name)
-        settings = ExcitationSettings(**e.excitation, duration=SECONDS, seed=100 * seed + i)
+        settings = ExcitationSettings(**e.excitation, duration=seconds, seed=100 * seed + i)
         true = replace(
             e.setup,
             springs=tuple(
@@ -59,7 +61,7 @@ def records_of(machine, seed, spring_error=0.0):
             ),
         )
         record = rehearse(f'{i}_{name}', machine, true, e.initial_state,
-                          [make_signal(settings)], SECONDS, seed=1000 * seed + i)
+                          [make_signal(settings)], seconds, seed=1000 * seed + i)
         found.append(replace(record, setup=e.setup))
     return found
 
@@ -95,7 +97,7 @@ def hide(nominal, effects, size, seed):
     return nominal, machine, values
 
 
-def case(effects, size, seed, faults):
+def case(effects, size, seed, faults, workers=None):
     """One line of the raw results."""
     nominal, machine, values = hide(
         Model.load(model_path(NOMINAL_MODEL)), effects, size, seed
@@ -103,7 +105,8 @@ def case(effects, size, seed, faults):
     if faults:
         machine = with_small_faults(machine)
     began = time.monotonic()
-    found = diagnose(nominal, records_of(machine, seed, 0.01 if faults else 0.0))
+    records = records_of(machine, seed, 0.01 if faults else 0.0)
+    found = diagnose(nominal, records, Options(workers=workers))
     causes = sorted({effect_name(c.label) for c in found.causes})
     named = sorted({*causes, *(effect_name(r) for c in found.causes for r in c.rivals)})
     before, after = found.baseline.held, found.extended.held
@@ -239,6 +242,7 @@ def main():
     parser.add_argument('--sizes', default='1', help='factors of the sizes, drawn for each case')
     parser.add_argument('--pairs', type=int, default=0, help='hide two effects, this many times')
     parser.add_argument('--faults', action='store_true', help='leave in small faults')
+    parser.add_argument('--workers', type=int, help='processes of each diagnosis')
     parser.add_argument('--raw', type=Path, default=Path('bench/results/hidden_effects.jsonl'))
     parser.add_argument('--write', type=Path)
     parser.add_argument('--picture', type=Path)
@@ -249,7 +253,7 @@ def main():
     for effects, size, seed, faults in () if options.table_only else cases_of(options, known):
         if wanted is not None and not wanted & set(effects or ('none',)):
             continue
-        row = case(effects, size, seed, faults)
+        row = case(effects, size, seed, faults, options.workers)
         seen = verdict_of(row)
         print(*(k for k, v in seen.items() if v), row, flush=True)
         with options.raw.open('a') as raw:

@@ -21,7 +21,9 @@ SCREEN_ITERATIONS = 16
 ITERATIONS = 60
 SCREEN_S = 2.0  # length of the first look at each start of a candidate
 MOST_STARTS = 24
-FOLLOWED = 3  # starts of a swept parameter that are worth a second look
+FOLLOWED = 3  # starts that are worth a second look
+FOLLOWING = 8  # iterations of each, before the best of them is chosen
+SAME = 1.01  # ratio of the errors of two fits that may be one minimum
 SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
 WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
 SETTLED = 1.2  # chi2/N at which nothing is left to find
@@ -40,7 +42,8 @@ class Task:
         events: What happened in each trial alone, as far as the base knows it: name of the trial
             -> own values (unknowns.own_unknowns).
         bounds: Small faults that the base may have (imperfections.py).
-        so_far: Go on from this fit; without one from the effect's own starts.
+        leads: Go on from the best of these fits, the most promising first; without any from
+            the effect's own starts.
         iterations: Limit for whole records.
     """
 
@@ -48,7 +51,7 @@ class Task:
     effect: tuple[str, str | None] | None = None
     events: Mapping[str, np.ndarray] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
-    so_far: Fit | None = None
+    leads: tuple[Fit, ...] = ()
     iterations: int = ITERATIONS
 
 
@@ -138,10 +141,10 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     if _eventful(task) or late or longest < 2 * SCREEN_S:
         return Look(label, task, np.nan)
     try:
-        found = _first_seconds(task, train)
+        leads = _first_seconds(task, train)
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
-    return Look(label, replace(task, so_far=found), found.normalised_error)
+    return Look(label, replace(task, leads=leads), leads[0].normalised_error)
 
 
 def _unbound(task: Task) -> Task:
@@ -220,14 +223,30 @@ def cost_of(task: Task) -> int:
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     if _eventful(task):
         return _event_fit(task, train)
-    models = list(_starting_models(task))
-    start = task.so_far
-    if start is None and len(models) > 1:
-        start = _first_seconds(task, train)
+    model, leads = next(_starting_models(task)), task.leads
+    if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
+        leads = _first_seconds(task, train)
+    if not leads:
+        return _whole(task, model, train, None, task.iterations)
+    # The first seconds may mislead where the error has many minima: a resonance that is not
+    # excited yet, a gap that is passed once.
+    best = _whole(task, model, train, leads[0], FOLLOWING)
+    for lead in leads[1:]:
+        if best.normalised_error < SETTLED:
+            break
+        other = _whole(task, model, train, lead, FOLLOWING)
+        best = min(best, other, key=lambda found: found.normalised_error)
+    left = task.iterations - FOLLOWING
+    return best if best.converged or left < 1 else _whole(task, model, train, best, left)
+
+
+def _whole(
+    task: Task, model: Model, train: Sequence[Trial], start: Fit | None, iterations: int
+) -> Fit:
+    """Fit whole records."""
     return fit(
-        models[0], train, start=start, own=task.events, bounds=task.bounds,
-        iterations=task.iterations,
-    )  # fmt: skip
+        model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations
+    )
 
 
 def _eventful(task: Task) -> bool:
@@ -235,22 +254,26 @@ def _eventful(task: Task) -> bool:
     return own_unknowns(task.model) != own_unknowns(next(_starting_models(task)))
 
 
-def _first_seconds(task: Task, train: Sequence[Trial]) -> Fit:
-    """The best of the fits to the first seconds, from every start."""
+def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
+    """Fits to the first seconds from every start: the best, and others that differ from it."""
     models = list(_starting_models(task))
     kept = _swept(models[0])
     looks = _looks(task, models, train, kept)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
         looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
-    return looks[0][0]
+    leads: list[Fit] = []
+    for look, _ in looks:
+        if not leads or look.normalised_error > SAME * leads[-1].normalised_error:
+            leads.append(look)
+    return tuple(leads[:FOLLOWED])
 
 
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     """An effect of which every record has its own size and instant."""
-    settled = task.so_far or fit(task.model, train, bounds=task.bounds)
+    best = task.leads[0] if task.leads else None
+    settled = best or fit(task.model, train, bounds=task.bounds)
     nothing = settled.normalised_error
-    best = task.so_far
     for _ in range(SEEKINGS if best else 1):
         # What was a push is at first taken for other parameters: seek again when it is not.
         at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
@@ -264,7 +287,7 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
         if best.normalised_error < SETTLED:
             return fit(model, train, start=best, bounds=task.bounds)
     assert best is not None
-    found = bool(task.so_far) or best.normalised_error > WORTH_SEEKING * nothing
+    found = bool(task.leads) or best.normalised_error > WORTH_SEEKING * nothing
     return replace(best, converged=found)
 
 

@@ -331,8 +331,8 @@ def _vibrating(base: Outcome, term: Term, sides: Sides, run: Run) -> Unmodelled 
         for trial in side
     }
     tasks = [
-        replace(base.task, model=base.model, effect=None, events=base.events, so_far=None),
-        replace(base.task, model=model, effect=None, events=events, so_far=None),
+        replace(base.task, model=base.model, effect=None, events=base.events, leads=()),
+        replace(base.task, model=model, effect=None, events=events, leads=()),
     ]
     contest = _contest(tasks, [term.label], sides, run)
     if contest is None or contest.ranked[0][0].reason:

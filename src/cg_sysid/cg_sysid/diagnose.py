@@ -338,7 +338,7 @@ class _Search:
         first = self._fitted([replace(t, iterations=FIRST_ITERATIONS) for t in worth], what)
         best = min((chi2(o) for o in first.values()), default=0.0)
         again = [
-            replace(o.task, so_far=o.train, iterations=ITERATIONS)
+            replace(o.task, leads=(o.train,), iterations=ITERATIONS)
             for o in first.values()
             if not o.train.converged and chi2(o) < IN_REACH * best
         ]

@@ -25,11 +25,11 @@ class Backlash(Effect):
     parameters = (
         Parameter(
             'gap', 'rad', 'total play at the joint', 2e-4, 0.3,
-            neutral=0.0, starts=(0.005, 0.03), scale=0.001, logarithmic=True,
+            neutral=0.0, starts=(0.005, 0.015, 0.05), scale=0.001, logarithmic=True,
         ),
         Parameter(
             'rotor_inertia', 'kg m^2', 'seen from the joint', 1e-5, 10.0,
-            starts=(0.1,), scale=0.01, logarithmic=True,
+            starts=(0.05, 0.1, 0.2), scale=0.01, logarithmic=True,
         ),
         Parameter(
             'stiffness', 'N m/rad', 'of the touching teeth', 1.0, 1e5,

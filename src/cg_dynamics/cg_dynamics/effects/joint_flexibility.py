@@ -21,7 +21,8 @@ class JointFlexibility(Effect):
     parameters = (
         Parameter(
             'stiffness', 'N m/rad', 'k', 0.05, 1e5,
-            neutral=float('inf'), starts=(300.0, 3000.0), scale=10.0, logarithmic=True,
+            neutral=float('inf'), starts=(60.0, 200.0, 600.0, 2000.0, 8000.0), scale=10.0,
+            logarithmic=True,
         ),
         Parameter(
             'rotor_inertia', 'kg m^2', 'J, seen from the joint', 1e-5, 10.0,
