@@ -102,8 +102,8 @@ def test_found_where_the_first_seconds_mislead(model_file, effect, values):
     nominal = Model.load(model_file)
     off = {'c4': 1.11 * nominal.values['c4'], 'c5': 0.85 * nominal.values['c5']}
     machine = nominal.with_values(off).with_effect(effect, **values)
-    train, held = prepare(nominal, [_slow_sweep(machine, k) for k in range(2)])
-    outcome = try_candidate(Task(nominal, (effect, None)), [train], [held])
+    *train, held = prepare(nominal, [_slow_sweep(machine, k) for k in range(3)])
+    outcome = try_candidate(Task(nominal, (effect, None)), train, [held])
     # Noise alone gives 1, within a few percent at a thousand rows.
     assert outcome.held.normalised_error < 1.2
     for name, value in values.items():
