@@ -105,7 +105,9 @@ def run(study, data, bags, workers):
     used = windows(usable, study.window)
     refitted = fit(nominal, prepare(nominal, used)).model
     found = diagnose(nominal, used, Options(workers=workers))
-    extended = fit(believing(found.extended.model, nominal), prepare(nominal, used)).model
+    # The file's beliefs, and the effects found with their values as a start.
+    structure = believing(found.extended.model, nominal, '')
+    extended = fit(structure, prepare(nominal, used)).model
     rows = {
         'published': errors(study, nominal, judges),
         'published model, identified anew': errors(study, refitted, judges),

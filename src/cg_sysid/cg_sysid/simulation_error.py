@@ -232,8 +232,19 @@ def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]
     factors = []
     for d, e, own_g in point.own:
         damped = d + damping * np.diag(np.diag(d))
-        solved = np.linalg.solve(damped, np.column_stack([e, own_g]))
+        solved = _solve(damped, np.column_stack([e, own_g]))
         h -= e.T @ solved[:, :-1]
         g -= e.T @ solved[:, -1]
         factors.append(solved)
     return h, g, factors
+
+
+def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a x = b for a curvature; directions lost beside far steeper ones stay where they are."""
+    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+    scaled, b = a / np.outer(scale, scale), b / scale[:, None]
+    try:
+        x = np.linalg.solve(scaled, b)
+    except np.linalg.LinAlgError:
+        x = np.linalg.lstsq(scaled, b, rcond=1e-12)[0]
+    return x / scale[:, None]
