@@ -82,7 +82,8 @@ def main():
         log for log in json.loads((folder / 'logs.json').read_text()) if log['kp'] == 200
     ]
     files = sorted(folder.glob('published_params_*.json'))
-    print('| model | ' + ' | '.join(f.stem.removeprefix('published_params_') for f in files) + ' |')
+    sets = [file.stem.removeprefix('published_params_') for file in files]
+    print('| model | ' + ' | '.join(sets) + ' |')
     print('|---|' + '---|' * len(files))
     published = [json.loads(file.read_text()) for file in files]
     for model in MODELS:

@@ -240,7 +240,7 @@ def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]
 
 
 def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x = b for a curvature; directions lost beside far steeper ones stay where they are."""
+    """The x of a x = b for a curvature a; directions lost beside far steeper ones stay."""
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     scaled, b = a / np.outer(scale, scale), b / scale[:, None]
     try:

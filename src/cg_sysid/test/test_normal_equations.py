@@ -30,6 +30,7 @@ def test_a_direction_that_rounding_has_lost_is_no_failure():
     steep = np.full((2, 2), 1e30)
     h, gradient, factors = reduced(_point(steep + 1e4 * np.eye(2), np.ones((2, 1)),
                                           np.array([2e10, 2e10])), 0.0)
-    assert np.isfinite(h).all() and np.isfinite(gradient).all()
+    assert np.isfinite(h).all()
+    assert np.isfinite(gradient).all()
     # The sum of the unknowns goes where the data say, by equal shares.
     assert factors[0][:, -1] == pytest.approx([1e-20, 1e-20], rel=1e-6)
