@@ -11,7 +11,8 @@ and encoder counts), and the analysis gets the records and the nominal file. `he
 nothing. With `--faults` what every real robot has stays in, unmodelled: a delay of 1 ms, friction
 that turns twice as fast, springs 1 % off, an encoder 0.3 mrad off. `--pairs` hides two effects.
 
-A case is *exact* if causes and rivals together are what was hidden, *top* if the causes are, and
+A case is *exact* if causes and rivals together are what was hidden (a delay of the torques and one
+of all readings are one and the same and have to come together), *top* if the causes are, and
 *found* if what was hidden is among causes and rivals. Every case is one line of `--raw`, and the
 table is made from all lines there: long runs can be done in pieces, and beside each other with
 `--workers 1` each.
@@ -45,6 +46,8 @@ PROGRAMME = (
     'swing_outer_fixed',
 ) * 2
 SECONDS = 8.0
+# To torques late and all readings late by one time only the first moments of a record differ.
+THE_SAME = ({'actuator_delay', 'sensor_delay'},)
 SHARE = 3.0  # of the noise: causes that explain less are not counted as hidden
 
 
@@ -130,7 +133,8 @@ def case(effects, size, seed, faults, workers=None):
 
 def verdict_of(row):
     hidden, causes, named = (set(row[k]) for k in ('hidden', 'causes', 'named'))
-    return {'exact': named == hidden, 'top': causes == hidden, 'found': hidden <= named}
+    whole = hidden.union(*(same for same in THE_SAME if hidden & same))
+    return {'exact': named == whole, 'top': causes == hidden, 'found': hidden <= named}
 
 
 def table_of(rows):
