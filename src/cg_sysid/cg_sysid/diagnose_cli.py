@@ -126,6 +126,7 @@ def work(options: argparse.Namespace) -> int:
         write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
+    cli.print_steps(Console(), intake.steps, len(intake.records))
     show(Console(), facts, options.out, options.quiet)
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
 
