@@ -5,16 +5,17 @@ falls by `slope` ahead its height is
 
     phi(q) = r_z + r_x tan(slope)                                                (GUARD)
 
-An impact is where phi falls through zero while the foot is ahead of the stance foot. The legs are
-equally long, so phi also touches zero when they pass each other: there the real robot has its
-feet retracted, and the guard must not fire. It cannot: it asks for r_x > minimum_step.
+An impact is where phi falls through zero while the foot is ahead of the stance foot (behind it,
+where the robot walks backwards). The legs are equally long, so phi also touches zero when they
+pass each other: there the real robot has its feet retracted, and the guard must not fire. It
+cannot: it asks for r_x > minimum_step.
 
 A foot that lands sticks, unless the model's effects say otherwise (contact.py): then it may slide
 or fly a little before it is held, and while friction holds it, it may begin to slide.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,7 +23,7 @@ from scipy.optimize import brentq
 
 from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import CompiledModel, compile_model
-from cg_dynamics.contact import Ground, contact_law, free_foot, land, rebound
+from cg_dynamics.contact import FreeFoot, Ground, contact_law, free_foot, land, rebound
 from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.impact import Impact, other
@@ -47,6 +48,7 @@ class WalkOptions:
         step: Runge-Kutta step in s.
         sample_time: Time from one command to the next in s; commands are held.
         minimum_step: Distance in m that the swing foot must be ahead for an impact.
+        backwards: The robot walks backwards: its swing foot lands behind the other one.
         clearance: Retraction of the swing foot in m. Where the extended foot would be deeper in
             the ground, the real one scuffs. Infinite: feet pass through the ground.
         stop_on_scuff: End at the first scuff.
@@ -58,6 +60,7 @@ class WalkOptions:
     step: float = 0.001
     sample_time: float = 0.002
     minimum_step: float = 0.02
+    backwards: bool = False
     clearance: float = math.inf
     stop_on_scuff: bool = False
     fall_angle: float = 1.0
@@ -82,8 +85,8 @@ class Event:
         stance: Stance leg until then.
         x: State until then.
         impact: What an impact or a bounce did; None for other kinds.
-        step_length: Distance in m from the old to the new stance foot along the ground; 0 for
-            other kinds.
+        step_length: Distance in m from the old to the new stance foot along the ground, negative
+            backwards; 0 for other kinds.
     """
 
     kind: str
@@ -200,6 +203,8 @@ def walk(
     duration: float,
     command: Command | None = None,
     options: WalkOptions | None = None,
+    law: ContactLaw | None = None,
+    torques: Sequence[tuple[float, float]] = (),
 ) -> Walk:
     """Simulate until time is over, the robot falls, or enough steps are done.
 
@@ -212,36 +217,57 @@ def walk(
             late by the model's input delay. None: no torque. Extra inputs of effects are
             switches that are on, and the time.
         options: How to walk.
+        law: How the ground receives a foot, instead of what the model's effects say.
+        torques: Recorded torques instead of a command: instant in s from which each acts, in
+            order, and its value in N m. Before the first, none does.
 
     Raises:
         SimulationError: if the state runs away.
     """
-    options = options or WalkOptions()
-    return _Walker(model, options, command).run(stance, np.asarray(x0, float), duration)
+    walker = _Walker(model, options or WalkOptions(), command, law)
+    return walker.run(stance, np.asarray(x0, float), duration, torques)
 
 
 class _Walker:
-    def __init__(self, model: Model, options: WalkOptions, command: Command | None):
+    def __init__(
+        self,
+        model: Model,
+        options: WalkOptions,
+        command: Command | None,
+        law: ContactLaw | None = None,
+    ):
         self.model, self.options = model, options
         self.command = command
         self.compiled = {s: compile_model(model, Setup(stance=s)) for s in STANCES}
         self.p = parameter_vector(model, Setup())
         self.leg_length = model.values['leg_length']
-        self.law, self.ground = contact_law(model), Ground(options.slope)
+        self.law, self.ground = law or contact_law(model), Ground(options.slope)
+        self.ahead = -1.0 if options.backwards else 1.0
         self.tangent = math.tan(options.slope)
         self.step = min(options.step, *(c.largest_step for c in self.compiled.values()))
         self.delay = self.compiled['inner'].delays(self.p)[0]
         self.events: list[Event] = []
         self.scuffed = False
+        self.free: dict[str, FreeFoot] = {}
+        self.asked: tuple[str, bytes, bytes] | None = None
+        self.answer = math.inf
 
-    def run(self, stance: str, x: np.ndarray, duration: float) -> Walk:
+    def run(
+        self,
+        stance: str,
+        x: np.ndarray,
+        duration: float,
+        torques: Sequence[tuple[float, float]] = (),
+    ) -> Walk:
         compiled = self.compiled[stance]
+        # Torques on their way: (instant at which it acts, torque).
+        latches = [(instant, self._inputs(torque)) for instant, torque in torques]
         u = self._inputs(0.0)
+        while latches and latches[0][0] <= INSTANT:
+            u = latches.pop(0)[1]
         if len(x) != compiled.nx:
             x = compiled.initial_state(x[:4], u, self.p)
         leg, arcs, outcome = _Leg(stance, compiled), [], 'time'
-        # Torques on their way: (instant at which it acts, torque).
-        latches: list[tuple[float, np.ndarray]] = []
         t, tick = 0.0, 0
         while t < duration - INSTANT and outcome == 'time':
             if self.command is not None:
@@ -305,17 +331,27 @@ class _Walker:
         return _Leg(leg.stance, leg.compiled, 'stick', place), x
 
     def _force(self, leg: _Leg, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.asarray(free_foot(self.model, leg.stance).force(x, u, self.p)).ravel()
+        return np.asarray(self._free(leg.stance).force(x, u, self.p)).ravel()
+
+    def _free(self, stance: str) -> FreeFoot:
+        if stance not in self.free:
+            self.free[stance] = free_foot(self.model, stance)
+        return self.free[stance]
 
     def _cone(self, leg: _Leg, x: np.ndarray, u: np.ndarray) -> float:
         """How far inside the cone of friction the force on a held foot is, in N."""
         if math.isinf(self.law.friction):
             return math.inf
-        force = self._force(leg, x, u)
-        return float(
-            self.law.friction * (force @ self.ground.normal)
-            - abs(force @ self.ground.tangent)
-        )
+        # The end of one step is the start of the next.
+        asked = (leg.stance, x.tobytes(), u.tobytes())
+        if asked != self.asked:
+            force = self._force(leg, x, u)
+            self.asked = asked
+            self.answer = float(
+                self.law.friction * (force @ self.ground.normal)
+                - abs(force @ self.ground.tangent)
+            )
+        return self.answer
 
     def _one_step(self, leg: _Leg, t: float, x: np.ndarray, u: np.ndarray, h: float):
         """One Runge-Kutta step, cut short where something happens."""
@@ -342,7 +378,7 @@ class _Walker:
         for part, kind in sorted(found):
             z = after(part)
             reach, _ = swing_foot(z, leg.stance, self.leg_length)
-            if kind == 'impact' and reach <= self.options.minimum_step:
+            if kind == 'impact' and self.ahead * reach <= self.options.minimum_step:
                 continue
             if kind == 'scuff':
                 if self.scuffed:
@@ -378,7 +414,7 @@ class _Walker:
                 return y
 
             return pinned
-        functions = free_foot(self.model, leg.stance)
+        functions = self._free(leg.stance)
         move = functions.slide if leg.mode == 'slide' else functions.flight
         start = np.concatenate([x, leg.place, leg.rate])
         c, slope = self._grip(leg), self.options.slope
@@ -403,7 +439,7 @@ class _Walker:
         if leg.mode == 'stick' and math.isfinite(self.law.friction):
             yield 'slip', lambda x: self._cone(leg, x, u)
         elif leg.mode == 'slide':
-            normal = free_foot(self.model, leg.stance).normal_force
+            normal = self._free(leg.stance).normal_force
             grip, slope = self._grip(leg), self.options.slope
             yield 'stick', lambda y: leg.sense * (y[nx + 2 :] @ t)
             yield 'lift', lambda y: float(normal(y, u, self.p, grip, slope))

@@ -17,7 +17,7 @@ class ImpactRestitution(LandingEffect):
     parameters = (
         Parameter(
             'coefficient', '1', 'e, rebound speed over speed of approach', 0.0, 0.99,
-            neutral=0.0, starts=(0.1, 0.3, 0.6), free=False, scale=0.02,
+            neutral=0.0, starts=(0.1, 0.3, 0.03, 0.6), free=False, scale=0.02,
         ),
     )  # fmt: skip
 
