@@ -88,7 +88,7 @@ def contact_impulse(
         rebound = 0.0
     after = 'flight' if rebound else ''
     stuck = np.linalg.solve(W, rebound * n - u)
-    if abs(t @ stuck) <= law.friction * (n @ stuck):
+    if math.isinf(law.friction) or abs(t @ stuck) <= law.friction * (n @ stuck):
         return stuck, after or 'stick'
     # The way that the foot cannot help sliding comes first; with a slanted W it may be the other.
     first = -np.sign(t @ stuck)

@@ -116,7 +116,8 @@ def work(options: argparse.Namespace) -> int:
             answer = None
         else:
             answer = diagnose(
-                model, intake.records, _options(options, effects, intake, model), bars, executor
+                model, intake.records, _options(options, effects, intake, model), bars, executor,
+                intake.landings,
             )
             lines = diagnosis_curves(answer)
             facts = diagnosis_facts(answer, intake, origin, lines)
