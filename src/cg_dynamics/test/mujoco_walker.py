@@ -15,6 +15,9 @@ from mujoco_robot import NEGLIGIBLE, _legs
 
 RADIUS = 5e-4
 STEP = 5e-5
+# Time constant in s and damping ratio of the ground. Critical damping would be enough for a spring
+# and a mass; this contact then throws a foot up with a tenth of its speed.
+PLASTIC = (5e-4, 8.0)
 
 
 class MujocoWalker:
@@ -27,8 +30,8 @@ class MujocoWalker:
         slope: Fall of the ground ahead in rad; angles are from the vertical.
         friction: Coefficient of the ground.
         hip_friction: Rate of the hip angle in rad/s -> torque in N m.
-        stiffness: Of the ground in N/m, and `damping` in N s/m; None for as plastic as it gets.
         payload: (leg, mass, distance from its foot), or None.
+        solref: Time constant in s and damping ratio of the ground.
     """
 
     def __init__(
@@ -40,7 +43,7 @@ class MujocoWalker:
         friction: float = 2.0,
         hip_friction: Callable[[float], float] | None = None,
         payload: tuple[str, float, float] | None = None,
-        solref: tuple[float, float] = (2e-4, 1.0),
+        solref: tuple[float, float] = PLASTIC,
     ):
         if abs(values['c3']) > NEGLIGIBLE or abs(values['c6']) > NEGLIGIBLE:
             raise ValueError('c3 and c6 must be negligible')

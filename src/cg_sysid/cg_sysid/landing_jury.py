@@ -15,6 +15,7 @@ from cg_dynamics.contact import contact_law
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
 from cg_sysid.contact_fit import FREE, SMALLEST, ContactFit, ContactTask, fit_contact
 from cg_sysid.diagnosis import MARGIN
 from cg_sysid.evidence import block_gain, evidence, independent_samples
@@ -50,7 +51,7 @@ def judge_landings(
         effects: Names of the effects to try; by default all.
     """
     passages = ready(model, landings, sigma)
-    train, held = (tuple(_some(passages[k::2])) for k in (0, 1))
+    train, held = _split(passages)
     if min(len(train), len(held)) < FEWEST:
         return None
     stated = contact_law(model)
@@ -67,6 +68,17 @@ def judge_landings(
         if best is not None and len(names) > 1 and not _at_noise(best, len(train)):
             fits += _fits(run, task, [tuple(names)])
     return _verdict(task, base, fits, len(landings))
+
+
+def _split(
+    passages: Sequence[Passage],
+) -> tuple[tuple[Passage, ...], tuple[Passage, ...]]:
+    """Training and held-out landings: of each leg, every second one is held out."""
+    sides: tuple[list[Passage], list[Passage]] = [], []
+    for first, stance in enumerate(STANCES):
+        for k, passage in enumerate(p for p in passages if p.stance == stance):
+            sides[(k + first) % 2].append(passage)
+    return tuple(_some(sides[0])), tuple(_some(sides[1]))
 
 
 def _some(passages: Sequence[Passage]) -> list[Passage]:
@@ -90,6 +102,9 @@ def _verdict(
     leader = min([base, *fits], key=lambda f: f.chi2)
     steps = [float(np.median(np.diff(p.time))) for p in passages]
     independent = independent_samples(leader.residuals, steps)
+
+    # What a wrong law leaves is correlated and says less than as many independent samples would.
+    fits = [_surely(fit, independent_samples(fit.residuals, steps)) for fit in fits]
 
     def weight(fit: ContactFit) -> float:
         return evidence(fit.chi2, fit.samples, independent, len(fit.effects), fit.belief)
@@ -124,6 +139,11 @@ def _verdict(
         independent=independent,
         impulses=tuple(_impulses(task, final, passages)),
     )
+
+
+def _surely(fit: ContactFit, independent: float) -> ContactFit:
+    factor = float(np.sqrt(max(1.0, fit.samples / independent)))
+    return replace(fit, values={n: (v, factor * s) for n, (v, s) in fit.values.items()})
 
 
 def _judged(

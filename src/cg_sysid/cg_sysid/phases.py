@@ -25,11 +25,14 @@ PIECE_S = 0.08  # length of the pieces that are compared
 STRIDE_S = 0.01  # from one of them to the next
 GUARD_S = 0.008  # on both sides of a touchdown, whose instant is known to some samples
 ROUGHLY = 20.0  # times the usual error from which a piece is not that of a foot that is held
-WORSE = 3.0  # the same once the model's numbers are those of these records
+WORSE = 4.0  # the same once the model's numbers are those of these records
+FAR = 2.0  # times that limit, far from any touchdown
 AFTER_S = 0.4  # s after a touchdown in which a foot may slide, and `BEFORE_S` before the next
 BEFORE_S = 0.25
 FORGIVEN_S = 0.01  # s at the edge of a piece in which an error does not show
 ITERATIONS = 16  # of the fit that makes its numbers so
+TRIMMINGS = 4  # such fits, at most
+LEFT_BEHIND = 10.0  # times the usual error of a phase
 SHORTEST_S = 0.15  # of a phase that says anything
 
 
@@ -93,11 +96,26 @@ def cut_steps(records: Sequence[Record], model: Model | None) -> Cut:
 
 
 def _identified(model: Model, phases: Sequence[Record]) -> Model:
-    """The model with the numbers of these phases: what it lacks shows least in it."""
-    try:
-        return fit(model, prepare(model, phases), iterations=ITERATIONS).model
-    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
-        return model
+    """The model with the numbers of these phases: what it lacks shows least in it.
+
+    A phase that is one slide from end to end would pull all numbers its way: those that are left
+    far behind are let go.
+    """
+    trials = prepare(model, phases)
+    better = model
+    for _ in range(TRIMMINGS):
+        try:
+            found = fit(model, trials, iterations=ITERATIONS)
+        except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+            return better
+        better = found.model
+        errors = (found.mse * found.count).sum(axis=1) / found.count.sum(axis=1)
+        limit = LEFT_BEHIND * max(1.0, float(np.median(errors)))
+        kept = [trial for trial, error in zip(trials, errors, strict=True) if error < limit]
+        if len(kept) == len(trials):
+            break
+        trials = kept
+    return better
 
 
 def _cut(
@@ -134,12 +152,16 @@ def _held(
     found: list[tuple[float, float] | None] = []
     for k, ((a, b), begin, error) in enumerate(zip(bounds, starts, errors, strict=True)):
         alike = [e for e, s in zip(errors, stances, strict=True) if s == stances[k] and len(e)]
-        usual = float(np.nanmedian(np.concatenate(alike))) if alike else 1.0
-        held = ~(error > worse * max(1.0, usual))
-        # What is wrong far from any touchdown is wrong with the model.
-        held |= (begin > edges[k] + AFTER_S) & (begin + PIECE_S < edges[k + 1] - BEFORE_S)
-        run = _longest(held)
+        # Of a robot that falls more of the time is a slide than not.
+        usual = max(1.0, float(np.nanquantile(np.concatenate(alike), 0.25))) if alike else 1.0
+        # What is a little wrong far from any touchdown is wrong with the model.
+        far = (begin > edges[k] + AFTER_S) & (begin + PIECE_S < edges[k + 1] - BEFORE_S)
+        run = _longest(~(error > usual * np.where(far, FAR * worse, worse)))
         span = None
+        # Of a phase that is a slide for the most part nothing is kept.
+        if run is not None and run != (0, len(begin) - 1):
+            kept = error[run[0] : run[1] + 1]
+            run = None if np.median(kept) > worse * usual else run
         if run is not None:
             first, final = run
             span = (
