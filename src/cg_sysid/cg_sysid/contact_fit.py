@@ -29,12 +29,12 @@ KEPT = 0.5  # share of the promised gain
 # it says no more than off by five: or else every sample would fence the instant of an event in.
 SATURATED = 5.0
 ITERATIONS = 12
-FIRST_ITERATIONS = 3  # of the landings' own unknowns at a start
-LOOKED_AT = 6  # landings by which starts are compared
+FIRST_ITERATIONS = 2  # of the landings' own unknowns at a start
+LOOKED_AT = 4  # landings by which starts are compared
 SHIFTS = (1.5e-3, -1.5e-3, 3e-3, -3e-3)  # rad, of the ground's slope
 POOR = (1.15, 30.0)  # chi2/N between which another instant of the touchdown may be the better one
 LONGEST = 0.7  # step of a coordinate
-DRIFT = 1e-4  # relative change of the cost at which it has converged
+DRIFT = 1e-3  # share of the cost above the noise that is a small change
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 
 
@@ -205,7 +205,7 @@ class _Fitter:
                 continue
             gain, promised = state.cost - r @ r, -(g @ step)
             state, damping = _State(state.own + step, r, J), damping / 10
-            if gain < max(DRIFT * state.cost, SMALL_GAIN):
+            if gain < _small(state.cost, passage):
                 break
             # Differences are dear: while they keep their promise they are used again.
             if gain < KEPT * promised:
@@ -297,7 +297,7 @@ class _Fitter:
                     return theta, states, True
                 continue
             theta, states, damping = candidate, moved, damping / 10
-            if before - after < max(DRIFT * after, SMALL_GAIN):
+            if before - after < _small(after, *train):
                 return theta, states, True
         return theta, states, False
 
@@ -350,6 +350,12 @@ class _Fitter:
         excess = max(1.0, cost / max(rows, 1))
         sandwich = inverse @ (np.transpose(scores) @ np.array(scores)) @ inverse
         return np.sqrt(np.maximum(np.diag(inverse) * excess, np.diag(sandwich)))
+
+
+def _small(cost: float, *passages: Passage) -> float:
+    """What is no gain any more, the less so the further the noise is."""
+    rows = sum(int(np.isfinite(passage.outputs).sum()) for passage in passages)
+    return SMALL_GAIN + DRIFT * max(cost - rows, 0.0)
 
 
 def _total(states: Sequence[_State | None]) -> float:

@@ -72,7 +72,7 @@ def _rates_after(
     """Rates of the legs in rad/s right after an instant, and their covariance."""
     names, since = model.mechanism.outputs, passage.time - instant
     rates, variances = {}, {}
-    for name, degree in (('imu_angle', 2), ('imu_rate', 1), ('hip_angle', 2)):
+    for name, degree in (('imu_angle', 2), ('imu_rate', 2), ('hip_angle', 2)):
         j = names.index(name)
         values = passage.outputs[:, j]
         rows = (since > 0) & (since <= AFTER_S) & np.isfinite(values)

@@ -27,7 +27,7 @@ from cg_sysid.phases import Landing
 
 MOST = 12  # landings that are fitted, and as many that judge
 FEWEST = 2  # of each
-BLOCK_S = 0.05  # blocks on which a gain is tested
+BLOCK_S = 0.025  # blocks on which a gain is tested
 LEFT = 0.35  # share of the error above the noise that an accepted law may leave
 TOO_SMALL = 2.0  # standard deviations within which a rebound may be none at all
 
@@ -65,7 +65,8 @@ def judge_landings(
     if not _at_noise(base, len(train)):
         fits = _fits(run, task, [(name,) for name in names])
         best = min((f for f in fits), key=lambda f: f.chi2, default=None)
-        if best is not None and len(names) > 1 and not _at_noise(best, len(train)):
+        # A little that is left is the ground's own softness, or the model's numbers.
+        if best is not None and len(names) > 1 and _error(best.residuals) > (1 + MATERIAL) ** 2:
             fits += _fits(run, task, [tuple(names)])
     return _verdict(task, base, fits, len(landings))
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walking import SLOPE, signals_of, stepping_command, walking
+from walking import SLOPE, stepping_command, walking
+from walking_records import as_record
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -15,9 +16,8 @@ from cg_sysid.check import check_recording
 from cg_sysid.diagnose import split
 from cg_sysid.intake import take_in
 from cg_sysid.phases import cut_steps
-from cg_sysid.record import Record
 from cg_sysid.rehearse import rehearse
-from cg_sysid.touchdown import find_touchdowns
+from cg_sysid.touchdown import Pieces, find_touchdowns
 from cg_sysid.trial import prepare
 
 MODEL = model_path('compass_gait_mit')
@@ -34,17 +34,6 @@ GROUNDS = {
 @pytest.fixture(scope='module')
 def nominal():
     return Model.load(MODEL)
-
-
-def as_record(name, done, stance, seed=0, mirrored=False, **sensing):
-    stamps, signals = signals_of(done, seed, **sensing)
-    if mirrored:
-        signals = {channel: -values for channel, values in signals.items()}
-    torque = signals.pop('hip_torque')
-    return Record(
-        name, (stamps * 1e9).round().astype(np.int64), {'hip_torque': torque}, signals,
-        'compass_gait', Setup(stance=stance),
-    )  # fmt: skip
 
 
 def on(model, ground):
@@ -187,16 +176,15 @@ def test_phases_hold_no_sample_of_a_bounce_or_a_slide(nominal, ground):
     ]
     cut = cut_steps(records, nominal)
     assert len(cut.landings) == sum(len(done.impacts) for done in walks)
+    pieces = {record.name: Pieces(record, machine) for record in records}
     for phase in cut.records:
-        record = records[int(phase.name[5])]
-        start, stop = (float(s) / 1e9 - record.stamp_ns[0] / 1e9 for s in phase.stamp_ns[[0, -1]])
-        for arc in walks[int(phase.name[5])].arcs:
-            shared = min(stop, arc.time[-1]) - max(start, arc.time[0])
-            if shared <= 0:
-                continue
-            assert arc.stance == phase.setup.stance
-            # What is left of the gentle end of a slide moves the legs by less than the noise.
-            assert arc.mode == 'stick' or shared < 0.04, (phase.name, arc.mode, shared)
+        name = phase.name[: len('walk_0')]
+        whole = pieces[name].record.stamp_ns[0]
+        start, stop = ((stamp - whole) / 1e9 for stamp in phase.stamp_ns[[0, -1]])
+        # The pinned machine itself explains it down to the noise: 500 samples and more, so that
+        # chi2/N scatters by less than a tenth; the gentle end of a slide may be left in it.
+        misfit = pieces[name].misfit(phase.setup.stance, start, stop)
+        assert misfit < (1.2 if ground == 'plastic' else 1.5), phase.name
     lost = 1 - sum(p.duration for p in cut.records) / sum(r.duration for r in records)
     assert lost < {'plastic': 0.06, 'impact_restitution': 0.15, 'foot_slip': 0.25}[ground]
 
