@@ -10,7 +10,7 @@ and then the landing leg is stance. Energies of effects (a payload) take part; f
 (torque, friction, springs) do not, and the rotor behind a flexible joint keeps its rate.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -37,6 +37,8 @@ class Impact:
         foot_velocity: Velocity of the foot that was stance, right after, in m/s. The model
             holds if its vertical part is not negative: that foot must leave the ground.
         energy_lost: In J.
+        landing_velocity: Velocity of the foot that landed, right after, in m/s; zero if it stuck.
+        mode: What that foot does then: 'stick', 'slide' or 'flight' (contact.py).
     """
 
     x_plus: np.ndarray
@@ -44,6 +46,8 @@ class Impact:
     impulse: np.ndarray
     foot_velocity: np.ndarray
     energy_lost: float
+    landing_velocity: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    mode: str = 'stick'
 
 
 def impact_function(model: Model, stance: str) -> ca.Function:

@@ -49,6 +49,11 @@ class Setup:
                 f'but stance is {self.stance!r}'
             )
 
+    @property
+    def may_step(self) -> bool:
+        """False if a fixture or springs, whose anchors stay where they are, forbid a step."""
+        return self.fixture == 'none' and not self.springs
+
     @classmethod
     def from_dict(cls, entries: dict[str, Any]) -> 'Setup':
         """Read a set-up as it stands in a recording note.

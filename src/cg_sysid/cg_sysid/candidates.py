@@ -109,7 +109,8 @@ def candidates_for(
             made = effect(model.mechanism, at)
             wanted = names is None or name in names or made.label in names
             asked |= wanted
-            if wanted and made.label not in present:
+            # Landings are judged by themselves, when all else is settled (landings.py).
+            if wanted and made.label not in present and effect.place != 'impact':
                 found.append((name, made.at))
     if names is not None and not asked:
         raise IdentificationError(

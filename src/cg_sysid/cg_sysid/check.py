@@ -29,6 +29,9 @@ from cg_sysid.check_timing import check_timing
 from cg_sysid.clock import mend_clocks
 from cg_sysid.errors import RecordingError
 from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.touchdown import find_touchdowns
+
+LANDING_S = 0.08  # s that a landing blurs on either side; twice that where the foot bounces
 
 
 def check_recording(
@@ -63,10 +66,11 @@ def check_recording(
     # What depends on several samples makes no sense where single ones, or their stamps, are wrong.
     faulty = {finding.where for finding in findings if finding.severity == 'error'}
     sane = {n: s for n, s in signals.items() if not faulty & {n, s.topic}}
-    findings += [*check_steps(raw, sane), *check_kinematics(sane)]
+    robot, unreadable = _model(model)
+    jumps = [*check_steps(raw, sane), *check_kinematics(sane)]
+    findings += _not_of_landings(raw, robot, jumps)
     sound = not any(finding.severity == 'error' for finding in findings)
     findings += check_dynamics(raw, signals, sound)
-    robot, unreadable = _model(model)
     findings += [*check_signs(raw, sane, robot), *unreadable]
     findings += check_content(raw, signals, model, use_region)
     if not any(finding.severity == 'error' for finding in findings):
@@ -90,6 +94,23 @@ def _model(path: str | Path | None) -> tuple[Model | None, list[Finding]]:
         return Model.load(path), []
     except ValueError as error:
         return None, [Finding('model_unreadable', 'info', '', str(error))]
+
+
+def _not_of_landings(
+    raw: RawRecording, robot: Model | None, jumps: list[Finding]
+) -> list[Finding]:
+    """Findings less those jumps that a foot made which landed, bounced or slid."""
+    if robot is None or not any(jump.code == 'zero_shift' for jump in jumps):
+        return jumps
+    try:
+        landed = [touchdown.time for touchdown in find_touchdowns(to_record(raw), robot)]
+    except RecordingError:
+        return jumps
+    return [
+        jump for jump in jumps
+        if jump.code != 'zero_shift' or jump.start_s is None
+        or not any(-LANDING_S < jump.start_s - time < 2 * LANDING_S for time in landed)
+    ]  # fmt: skip
 
 
 def _refused(raw: RawRecording) -> list[Finding]:

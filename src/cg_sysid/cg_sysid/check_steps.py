@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_sysid.channels import mechanism
 from cg_sysid.check_signals import Signal, without_spikes
 from cg_sysid.findings import Finding
@@ -37,10 +38,13 @@ def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
         for name in (*known.input_names, *known.output_names)
         if name in signals and np.ptp(signals[name].values) > 0.0
     }
+    knocks = raw.mechanism == CompassGait.name and raw.setup.may_step
     for name, signal in clean.items():
         if not name.endswith('angle'):
             continue  # a torque may jump, and a rate at a knock
-        step = find_step(signal.time, signal.values, signal.noise.sigma, signal.noise.quantum)
+        step = find_step(
+            signal.time, signal.values, signal.noise.sigma, signal.noise.quantum, knocks=knocks
+        )
         if step is None:
             continue
         place = (float(signal.time[step.sample - 1]), step.time, int(signal.sample[step.sample]))

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -165,6 +165,16 @@ def print_left_out(facts: Facts) -> None:
     for entry in facts['unusable']:
         print(f'left out {entry["source"]}: {one_line(ValueError(entry["reason"]))}',
               file=sys.stderr)  # fmt: skip
+
+
+def print_steps(console: Console, steps: Mapping[str, int], phases: int) -> None:
+    """One line on the steps of a walking robot, where there are any."""
+    if steps:
+        total = sum(steps.values())
+        console.print(
+            f'{total} step{"s" * (total != 1)} in {", ".join(steps)}: cut into '
+            f'{phases} stance phases', highlight=False,
+        )  # fmt: skip
 
 
 def print_findings(console: Console, findings: Sequence[str], most: int = 8) -> None:

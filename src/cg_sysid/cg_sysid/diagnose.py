@@ -5,6 +5,7 @@
          earned on records held out -> again on top of that, until nothing more is earned
       -> doubt each accepted effect beside the others: is it still earned, would another do
          better in its place? If so, exchange it and go on from there
+      -> with all of that in the model: how do the feet of a walking robot land?
 
 docs/diagnosis.md says how the decisions are taken and why.
 """
@@ -47,7 +48,9 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.imperfections import imperfect, with_imperfections
 from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
+from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
+from cg_sysid.phases import Landing
 from cg_sysid.record import Record
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
@@ -118,6 +121,7 @@ def diagnose(
     options: Options | None = None,
     progress: Progress | None = None,
     executor: Executor | None = None,
+    landings: Sequence[Landing] = (),
 ) -> Diagnosis:
     """Say what a model gets wrong about records of its machine.
 
@@ -127,6 +131,7 @@ def diagnose(
         options: How.
         progress: Called with (what, done, total).
         executor: Where candidates are fitted; by default local processes.
+        landings: What lies between the phases of walking records (phases.cut_steps).
 
     Raises:
         IdentificationError: if the records cannot be used with this model.
@@ -135,7 +140,7 @@ def diagnose(
     trials = [_led_in(trial) for trial in prepare(model, records)]
     train, held = split(trials, options.held)
     search = _Search(model, train, held, options, progress or (lambda *_: None), executor)
-    return search.run()
+    return with_landings(search.run(), landings, search.carry_out, options.effects)
 
 
 def _led_in(trial: Trial) -> Trial:
@@ -348,7 +353,7 @@ class _Search:
         return list({**first, **better}.values()), aside
 
     def _looked_at(self, tasks: list[Task], what: str) -> list[Look]:
-        looks = self._run(look_at, [(task, self.train) for task in tasks], what)
+        looks = self.carry_out(look_at, [(task, self.train) for task in tasks], what)
         for task, look in zip(tasks, looks, strict=True):
             if isinstance(look, str):
                 log.info('%s: %s', task.effect, look)
@@ -364,9 +369,10 @@ class _Search:
         return found
 
     def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
-        return self._run(try_candidate, [(task, self.train, self.held) for task in tasks], what)
+        arguments = [(task, self.train, self.held) for task in tasks]
+        return self.carry_out(try_candidate, arguments, what)
 
-    def _run(self, function: Callable, arguments: list[tuple], what: str) -> list:
+    def carry_out(self, function: Callable, arguments: list[tuple], what: str) -> list:
         return run_all(
             function, arguments, self.options.workers, self.executor,
             lambda done, total: self.progress(what, done, total),
@@ -421,7 +427,7 @@ class _Search:
         unmodelled = None
         if self._left(final):
             unmodelled, stand = what_remains(
-                nominal, final, self._added(final), self.train, self.held, self._run
+                nominal, final, self._added(final), self.train, self.held, self.carry_out
             )
             final = final if stand else nominal
         causes, left = self._causes(nominal, final), self._left(final)

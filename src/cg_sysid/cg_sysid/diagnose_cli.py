@@ -116,7 +116,8 @@ def work(options: argparse.Namespace) -> int:
             answer = None
         else:
             answer = diagnose(
-                model, intake.records, _options(options, effects, intake, model), bars, executor
+                model, intake.records, _options(options, effects, intake, model), bars, executor,
+                intake.landings,
             )
             lines = diagnosis_curves(answer)
             facts = diagnosis_facts(answer, intake, origin, lines)
@@ -126,6 +127,7 @@ def work(options: argparse.Namespace) -> int:
         write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
+    cli.print_steps(Console(), intake.steps, len(intake.records))
     show(Console(), facts, options.out, options.quiet)
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
 

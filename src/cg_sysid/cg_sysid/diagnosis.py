@@ -13,6 +13,7 @@ from cg_dynamics.model import Model
 from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
+from cg_sysid.landed import Landings
 from cg_sysid.trial import Trial
 from cg_sysid.unmodelled import NOTHING, Unmodelled
 
@@ -132,6 +133,7 @@ class Diagnosis:
         findings: What a person should know: warnings of the fits, lumps out of tolerance.
         unmodelled: What the extended model leaves above the noise, as a learned term; None if it
             leaves nothing or no such term is significant.
+        landings: What the landings of a walking robot say; None where there are too few.
     """
 
     verdict: str
@@ -147,6 +149,7 @@ class Diagnosis:
     remaining: dict[str, float]
     findings: tuple[str, ...] = ()
     unmodelled: Unmodelled | None = None
+    landings: Landings | None = None
 
 
 @dataclass(frozen=True)
@@ -226,10 +229,7 @@ def summary_of(
             f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
             f'{biggest.noise:.2g}. {unmodelled.text if unmodelled else NOTHING}'
         )
-    named = ', '.join(
-        f'{c.label} ({_described(c)})' + (f' or {" or ".join(c.rivals)}' if c.rivals else '')
-        for c in causes
-    )
+    named = ', '.join(described(c) for c in causes)
     if biggest.before < NO_GAIN * biggest.after and strained:
         text = (
             f'The simulation lacks {named}: without it the model follows the records only with '
@@ -253,11 +253,14 @@ def summary_of(
     return text
 
 
-def _described(cause: Cause) -> str:
-    return ', '.join(
+def described(cause: Cause) -> str:
+    """A cause with its numbers and rivals, in words."""
+    numbers = ', '.join(
         f'{name} = {value:.3g} +- {sigma:.1g}' + ('' if unit == '1' else f' {unit}')
         for name, (value, sigma, unit) in cause.parameters.items()
     )
+    rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
+    return f'{cause.label} ({numbers}){rivals}'
 
 
 def per_output(fit: Fit) -> np.ndarray:

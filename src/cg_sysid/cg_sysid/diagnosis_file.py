@@ -14,12 +14,14 @@ import numpy as np
 
 from cg_description.model_file import write_atomically
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.model import Model
 from cg_sysid.curves import Curve
 from cg_sysid.diagnosis import Candidate, Cause, Diagnosis, Gain, Round, gains_of
 from cg_sysid.findings import Finding
 from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
+from cg_sysid.landing_cause import landing_gains, words
 from cg_sysid.leftover import leftover
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import Unknown
@@ -72,7 +74,8 @@ def diagnosis_facts(
             if channel in {g.channel for g in diagnosis.gains}
         },
         'unmodelled': _unmodelled(diagnosis),
-        'ranking': [_round(r) for r in diagnosis.rounds],
+        'landings': _landings(diagnosis),
+        'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
         **_fitted(diagnosis.nominal, fit),
         'findings': list(diagnosis.findings),
         **_data(diagnosis.nominal, trials, roles, errors, counts, intake),
@@ -97,6 +100,7 @@ def unusable_facts(
         'gain': {},
         'remaining_error': {},
         'unmodelled': None,
+        'landings': None,
         'ranking': [],
         'parameters': [
             _parameter(model, name, None) for name in model.declarations
@@ -164,6 +168,7 @@ def identification_facts(
             if n
         },
         'unmodelled': None,
+        'landings': None,
         'ranking': [],
         **_fitted(model, fit),
         'findings': list(fit.warnings),
@@ -280,6 +285,71 @@ def _unmodelled(diagnosis: Diagnosis) -> Facts | None:
         'nearest': [_effect(label) for label in found.nearest],
         'gain': {g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in gains},
     }  # fmt: skip
+
+
+def _landings(diagnosis: Diagnosis) -> Facts | None:
+    found = diagnosis.landings
+    if found is None:
+        return None
+    best = found.best
+    return {
+        'touchdowns': found.found,
+        'judged': found.judged,
+        'text': words(diagnosis, found),
+        'stated': _law(found.stated),
+        'law': _law(best.law if best else found.stated),
+        'accepted': list(found.accepted),
+        'rivals': list(found.rivals),
+        'gain': {
+            g.channel: _gain(g.before, g.after, g.noise, g.unit)
+            for g in landing_gains(diagnosis, found)
+        },
+        'impulses': [
+            {
+                'name': impulse.name,
+                'along': impulse.measured[0],
+                'off': impulse.measured[1],
+                'covariance': impulse.covariance,
+                'plastic': list(impulse.plastic),
+            }
+            for impulse in found.impulses
+        ],
+    }
+
+
+def _law(law: ContactLaw) -> Facts:
+    return {'restitution': law.restitution, 'friction': law.friction}
+
+
+def _laws(diagnosis: Diagnosis) -> list[Facts]:
+    """The laws of contact that were tried, as a round."""
+    found = diagnosis.landings
+    if found is None or not found.tried:
+        return []
+    return [{
+        'base': 'landings',
+        'accepted': found.best.label if found.best else None,
+        'independent_samples': found.independent,
+        'candidates': [
+            {
+                **_effect(t.label),
+                'evidence_nats': t.evidence,
+                'held_gain': t.held_gain,
+                'significance': t.significance,
+                'explained_sigmas': t.explained,
+                'chi2_per_sample': {'train': t.errors[0], 'held': t.errors[1]},
+                'parameters': {
+                    k: v for name in t.effects for k, v in _values(
+                        t.parameters[name], name,
+                        {f'{name}.{p.name}': p for p in LIBRARY[name].parameters},
+                    ).items()
+                },
+                'reason': t.reason,
+            }
+            for t in found.tried
+        ],
+        'set_aside': [],
+    }]  # fmt: skip
 
 
 def _effect(label: str) -> Facts:

@@ -1,16 +1,19 @@
 """From bags on the command line to records that may be analysed, and what became of each bag."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cg_dynamics.model import Model
 from cg_sysid.bags import read_raw, to_record
 from cg_sysid.check import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.faults import FaultSignal, fault_signals
 from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.record import Record
 
 TORQUE_TOPICS = {'applied': '/applied_torque', 'command': '/torque_command'}
@@ -50,19 +53,26 @@ class Intake:
     """What a set of bags gave.
 
     Attributes:
-        records: Records (or windows of them) to be analysed.
+        records: Records (or windows of them, or stance phases) to be analysed.
         sources: Every bag, used or not.
         origin: Name of a record -> name of the bag that it is from.
+        landings: What lies between the phases of walking records (phases.py).
     """
 
     records: tuple[Record, ...]
     sources: tuple[Source, ...]
     origin: Mapping[str, str]
+    landings: tuple[Landing, ...] = ()
 
     @property
     def left_out(self) -> tuple[Source, ...]:
         """The bags that are not used."""
         return tuple(source for source in self.sources if source.reason)
+
+    @property
+    def steps(self) -> dict[str, int]:
+        """Name of a bag of a walking robot -> steps in it."""
+        return dict(Counter(self.origin[landing.record.name] for landing in self.landings))
 
 
 def take_in(
@@ -77,7 +87,7 @@ def take_in(
 
     Args:
         bags: Paths of bags.
-        model_file: Model file that they will be used with.
+        model_file: Model file that they will be used with; with it, walking records are cut.
         note: Recording note for bags that carry none.
         torque: `applied` or `command`; by default the applied torque where there is one.
         window: Cut records into windows of this length in s.
@@ -98,11 +108,17 @@ def take_in(
         sources.append(source)
         if record is None:
             continue
-        pieces = record.segments(window) if window and record.duration > window else [record]
-        records += pieces
-        origin |= {piece.name: name for piece in pieces}
+        records.append(record)
+        origin[record.name] = name
     progress('reading and checking bags', len(paths), len(paths))
-    return Intake(tuple(records), tuple(sources), origin)
+    cut = cut_steps(records, Model.load(model_file) if model_file else None)
+    pieces: list[Record] = []
+    for record in cut.records:
+        long = window is not None and record.duration > window
+        windows = record.segments(window) if window is not None and long else [record]
+        pieces += windows
+        origin |= {piece.name: origin[cut.origin[record.name]] for piece in windows}
+    return Intake(tuple(pieces), tuple(sources), origin, cut.landings)
 
 
 def _distinct(bags: Sequence[str | Path]) -> dict[str, Path]:

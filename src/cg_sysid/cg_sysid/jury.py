@@ -130,7 +130,7 @@ class Jury:
                 reasons.append('leaves numbers far from what the model file believes')
         elif significance < SIGNIFICANT or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
-        elif explained < MATERIAL:
+        elif explained < MATERIAL and not (strained(base) and not strained(o)):
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
         reasons += at_edge(o) + too_small(o)

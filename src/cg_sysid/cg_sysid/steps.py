@@ -17,6 +17,7 @@ JITTER = 0.03  # an instant of measurement is known to this share of the spacing
 USUAL = 3.0  # distance over that around it, where the motion is rougher than parabolas, [1]
 AROUND = 3  # spans on each side that show what is usual, but 100 samples at least
 AGREE = 0.3  # distances of two spans differ by less than this share, and noise
+KNOCK_S = 0.02  # s within which two branches meet that a knock, or some bounces, part
 HOLE = 1.8  # spacing over the usual one in which a motion may turn unseen, [1]
 
 
@@ -55,6 +56,7 @@ def find_step(
     sigma: float,
     quantum: float,
     spans: tuple[int, ...] = SPANS,
+    knocks: bool = False,
 ) -> Step | None:
     """The clearest step of a signal; None if there is none.
 
@@ -64,10 +66,12 @@ def find_step(
         sigma: White noise, in the unit of the values.
         quantum: Resolution, in the unit of the values.
         spans: Samples on each side of an instant, in increasing order.
+        knocks: The body may be knocked, as a foot that lands does: then branches of different
+            rate that meet close by are no step.
     """
     spacing = np.diff(time)
     usual = float(np.median(spacing))
-    grid, sampled = _on_grid(time, values)
+    grid, sampled = on_grid(time, values)
     if len(grid) < 4 * spans[-1] or len(grid) > 2 * len(time):
         return None
     holes = np.flatnonzero(spacing > HOLE * usual)
@@ -91,19 +95,30 @@ def find_step(
         larger = np.maximum(np.abs(size[i]), np.abs(size[i + 1]))
         agree = apart < AGREE * larger + 2.0 * sigma * _spread(spans[i])
         agreed = np.maximum(agreed, np.where(agree, pair, 0.0))
-    best = int(np.argmax(agreed))
-    if agreed[best] <= 1.0:
-        return None
-    widest = int(np.argmax(score[:, best]))
-    limit = abs(size[widest, best]) / score[widest, best]
-    return _step(time, grid, sampled, best, spans[widest], sigma, quantum, float(limit))
+    while True:
+        best = int(np.argmax(agreed))
+        if agreed[best] <= 1.0:
+            return None
+        widest = int(np.argmax(score[:, best]))
+        limit = abs(size[widest, best]) / score[widest, best]
+        step = _step(time, grid, sampled, best, spans[widest], sigma, quantum, float(limit))
+        if not (knocks and _knocked(step)):
+            return step
+        agreed[max(0, best - spans[-1]) : best + spans[-1]] = 0.0
+
+
+def _knocked(step: Step) -> bool:
+    """Whether the rate jumps, and the branches before and after meet close by."""
+    jump = step.rate_after - step.rate_before
+    sure = abs(jump) > CERTAIN * np.sqrt(2.0) * step.rate_sigma
+    return bool(sure and abs(step.size) < KNOCK_S * abs(jump))
 
 
 def step_at(
     time: np.ndarray, values: np.ndarray, sigma: float, quantum: float, instant: float
 ) -> Step | None:
     """What a signal does at an instant at which another one has a step; None near the ends."""
-    grid, sampled = _on_grid(time, values)
+    grid, sampled = on_grid(time, values)
     k = int(np.searchsorted(grid, instant - 0.5 * (grid[1] - grid[0])))
     span = SPANS[1]
     if k < span or k > len(grid) - span:
@@ -111,7 +126,7 @@ def step_at(
     return _step(time, grid, sampled, k, span, sigma, quantum, 0.0)
 
 
-def _on_grid(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def on_grid(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times at the usual spacing, and the values there."""
     usual = float(np.median(np.diff(time)))
     grid = time[0] + usual * np.arange(round((time[-1] - time[0]) / usual) + 1)

@@ -4,6 +4,7 @@ Arrays in the order of the model's channels, standard deviations that say how we
 can be matched at all, and a first guess of the motion at the first row.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -128,6 +129,7 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     )
 
 
+@functools.cache
 def sensor_matrix(body: Mechanism, setup: Setup) -> np.ndarray:
     """Outputs of ideal sensors as a matrix on (s, ds/dt), shape (ny, 2m): all are linear."""
     basis = body.kinematics(setup).basis

@@ -6,6 +6,7 @@ path is the order of the hooks below, so any effects compose:
 
     input --input_delay--> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
     Q and M also take energies, force, foot and up;   outputs: read, then output_delay
+    where a foot lands: landing
 
 In every hook `p` maps the effect's own parameter names to symbols and `z` holds its own extra
 states, a list; a hook that owns states returns their rates in the same order. Inputs that an
@@ -14,6 +15,7 @@ the start of the record (`time`, in s), and recorded switches, which count as on
 recorded them. In `read`, `p` also has the rates of the angles that ideal sensors would report.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -81,6 +83,24 @@ class Body:
             length = ca.sqrt(ca.sumsqr(end - ca.vertcat(p['anchor_x'], p['anchor_z'])))
             found.append((length - p['free_length'], p['stiffness']))
         return found
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """What the ground does to a foot that lands or stands: theory.md, "Contact".
+
+    Attributes:
+        restitution: Rebound speed over speed of approach, along the ground's normal.
+        friction: Coefficient of Coulomb's cone; infinite: the foot never slides.
+    """
+
+    restitution: float = 0.0
+    friction: float = math.inf
+
+    @property
+    def plastic(self) -> bool:
+        """True if a landing foot simply stays."""
+        return self.restitution == 0 and math.isinf(self.friction)
 
 
 class Effect:
@@ -191,6 +211,10 @@ class Effect:
         """Time in s by which a channel reports late."""
         return None
 
+    def landing(self, law: ContactLaw, p: Mapping[str, float]) -> ContactLaw:
+        """How the ground receives a foot; unlike the other hooks it is handed numbers."""
+        return law
+
     def initial_states(self, angle: ca.SX, rate: ca.SX, torque: ca.SX, p: Symbols) -> list[ca.SX]:
         """Extra states at the start of a record, from joint angle, rate and held torque."""
         return [ca.SX(0) for _ in self.states]
@@ -257,6 +281,22 @@ class StanceEffect(Effect):
     def applies(cls, setups: Sequence[Setup]) -> bool:
         """Only where the leg that stands is free to lean."""
         return any(setup.fixture not in ('inner_fixed', 'outer_fixed') for setup in setups)
+
+
+class LandingEffect(Effect):
+    """An effect of the ground on a foot that lands; within a stance phase it does nothing."""
+
+    place = 'impact'
+
+    @classmethod
+    def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
+        """Only the compass gait walks."""
+        return ('all',) if mechanism.name == 'compass_gait' else ()
+
+    @classmethod
+    def applies(cls, setups: Sequence[Setup]) -> bool:
+        """Only where a foot can land: no leg is fixed or held by springs."""
+        return any(setup.may_step for setup in setups)
 
 
 class SpringEffect(Effect):

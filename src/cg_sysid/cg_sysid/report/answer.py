@@ -3,6 +3,7 @@
 import math
 
 from cg_sysid.report.function import unmodelled
+from cg_sysid.report.landings import landings
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, left_words, parameter_words
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
@@ -26,6 +27,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
     left = [
         *[_cause(cause) for cause in facts['causes']],
         unmodelled(facts),
+        landings(facts),
         _faults(facts, drawn),
         _where(facts),
         _left_out(facts),

@@ -84,10 +84,10 @@ def picture(term: Facts) -> Markup:
     lower = [(a, b - BAND * e) for a, b, e in zip(s, g, sigma, strict=True)]
     parts = [
         *_seen(s, [f['seen'][k] for k in keep], x),
-        *_ticks(s[0], s[-1], across, lambda v, text: (
+        *axis_ticks(s[0], s[-1], across, lambda v, text: (
             tag('line', x1=x(v), x2=x(v), y1=TOP, y2=HEIGHT - BOTTOM, class_='rule'),
             tag('text', text, x=x(v), y=HEIGHT - BOTTOM + 15, text_anchor='middle'))),
-        *_ticks(low, high, factor, lambda v, text: (
+        *axis_ticks(low, high, factor, lambda v, text: (
             tag('line', x1=LEFT, x2=WIDTH - RIGHT, y1=y(v), y2=y(v), class_='rule'),
             tag('text', text, x=LEFT - 6, y=y(v) + 4, text_anchor='end'))),
         tag('path', d=path([*upper, *reversed(lower)]) + 'Z', class_='band'),
@@ -115,7 +115,7 @@ def _seen(s: list[float], seen: list[bool], x) -> list[Markup]:
     return found
 
 
-def _ticks(low: float, high: float, factor: float, draw) -> list[Markup]:
+def axis_ticks(low: float, high: float, factor: float, draw) -> list[Markup]:
     """Round values of an axis, each drawn by `draw(value, text)`."""
     span = (high - low) * factor
     rough = 10 ** math.floor(math.log10(span / TICKS))

@@ -61,6 +61,9 @@ def lead(facts: Facts) -> str:
         return 'Nothing was fitted. The places below need repair, or a new recording.'
     if verdict == 'identified' or not facts['gain']:
         return facts['summary']
+    landed = facts.get('landings')
+    if landed and facts['causes'] and all(c['place'] == 'impact' for c in facts['causes']):
+        return landed['text']
     channel = best_channel(facts)
     gain = facts['gain'][channel]
     before, after, noise = gain['before'], gain['after'], gain['noise_floor']
