@@ -20,6 +20,7 @@ table is made from all lines there: long runs can be done in pieces, and beside 
 
 import argparse
 import json
+import math
 import time
 from collections import Counter
 from dataclasses import replace
@@ -122,13 +123,28 @@ def case(effects, size, seed, faults, workers=None):
         'verdict': found.verdict, 'causes': causes, 'named': named, 'share': share,
         'before': before.normalised_error, 'after': after.normalised_error,
         'inside': [
-            bool(abs(c.parameters[n][0] - v) < 1.96 * c.parameters[n][1])
+            bool(abs(off) < 1.96 * sigma)
             for c in found.causes
-            for n, v in values.get(c.label, {}).items()
-            if n in c.parameters
+            for off, sigma in errors_of(c.parameters, values.get(c.label, {}))
         ],
         'seconds': round(time.monotonic() - began, 1),
     }  # fmt: skip
+
+
+def errors_of(found, hidden):
+    """Error and stated standard deviation of each parameter of a cause."""
+    # A sin(x) and -A sin(x + pi) are the same wave.
+    turned = 'phase' in hidden and found['amplitude'][0] * hidden['amplitude'] < 0
+    for name, true in hidden.items():
+        if name not in found:
+            continue
+        value, sigma, _ = found[name]
+        if name == 'amplitude' and turned:
+            value = -value
+        if name == 'phase':
+            value += np.pi * turned
+            value = true + math.remainder(value - true, 2 * math.pi)
+        yield value - true, sigma
 
 
 def verdict_of(row):
