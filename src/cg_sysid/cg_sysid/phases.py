@@ -156,7 +156,7 @@ def _held(
         usual = max(1.0, float(np.nanquantile(np.concatenate(alike), 0.25))) if alike else 1.0
         # What is a little wrong far from any touchdown is wrong with the model.
         far = (begin > edges[k] + AFTER_S) & (begin + PIECE_S < edges[k + 1] - BEFORE_S)
-        run = _longest(~(error > usual * np.where(far, FAR * worse, worse)))
+        run = longest_run(~(error > usual * np.where(far, FAR * worse, worse)))
         span = None
         # Of a phase that is a slide for the most part nothing is kept.
         if run is not None and run != (0, len(begin) - 1):
@@ -172,7 +172,7 @@ def _held(
     return found
 
 
-def _longest(fine: np.ndarray) -> tuple[int, int] | None:
+def longest_run(fine: np.ndarray) -> tuple[int, int] | None:
     """First and last index of the longest run of True; None where there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], fine, [False]]).astype(int)))
     if not len(edges):
