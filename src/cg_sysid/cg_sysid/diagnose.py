@@ -161,7 +161,9 @@ def diagnose(
                for a, b in zip(sides, (train, held), strict=True))  # fmt: skip
     if same or not all(sides):
         return found
-    return answer(*sides)
+    again = answer(*sides)
+    better = again.landings is not None and again.landings.after.sum() < found.landings.after.sum()
+    return again if better else found
 
 
 def _led_in(trial: Trial) -> Trial:

@@ -15,6 +15,7 @@ from cg_dynamics.contact import Ground
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.unpinned import ground_reaction
+from cg_sysid.landings import lasting
 from cg_sysid.phases import SHORTEST_S, longest_run
 from cg_sysid.trial import Trial
 
@@ -40,6 +41,7 @@ def held_by_friction(
     Returns:
         Those of which enough is left.
     """
+    model = lasting(model)
     found = (
         _held(model, trial, motion, friction, slope)
         for trial, motion in zip(trials, motions, strict=True)
