@@ -28,6 +28,9 @@ from cg_sysid.phases import Landing
 MOST = 12  # landings that are fitted, and as many that judge
 FEWEST = 2  # of each
 BLOCK_S = 0.025  # blocks on which a gain is tested
+# Landings are short and the rest of their motion is known: a rebound of a tenth, which lasts for ten
+# milliseconds, explains about one standard deviation of the noise.
+NOTICEABLE = 0.5
 LEFT = 0.35  # share of the error above the noise that an accepted law may leave
 GIVEN = 0.005  # share of a value that the numbers of the model, taken as given, may be worth
 SURE = 5.0  # standard deviations from which an impulse is known
@@ -180,9 +183,9 @@ def _judged(
         reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
     if significance < SIGNIFICANT or held_gain <= 0:
         reasons.append('no significant gain on landings held out')
-    elif explained < MATERIAL:
+    elif explained < NOTICEABLE:
         reasons.append(f'explains {explained:.2f} noise standard deviations, '
-                       f'{MATERIAL:g} needed')
+                       f'{NOTICEABLE:g} needed')
     left = max(errors[1] - 1, 0.0)
     if left > LEFT * max(was[1] - 1, 0.0) and errors[1] > AT_NOISE:
         reasons.append(f'leaves an error of {np.sqrt(errors[1]):.1f} noise standard deviations')
