@@ -27,9 +27,9 @@ from cg_sysid.phases import Landing
 
 MOST = 12  # landings that are fitted, and as many that judge
 FEWEST = 2  # of each
-BLOCK_S = 0.025  # blocks on which a gain is tested
-# Landings are short and the rest of their motion is known: a rebound of a tenth, which lasts for ten
-# milliseconds, explains about one standard deviation of the noise.
+# Blocks on which a gain is tested: short where landings are few, long where a gain is small.
+BLOCKS_S = (0.025, 0.05, 0.1, 0.3)
+# A rebound of a tenth lasts for ten milliseconds and explains about one standard deviation.
 NOTICEABLE = 0.5
 LEFT = 0.35  # share of the error above the noise that an accepted law may leave
 GIVEN = 0.005  # share of a value that the numbers of the model, taken as given, may be worth
@@ -123,7 +123,7 @@ def _verdict(
     def weight(fit: ContactFit) -> float:
         return evidence(fit.chi2, fit.samples, independent, len(fit.effects), fit.belief)
 
-    rows = max(1, round(BLOCK_S / float(np.median(steps))))
+    rows = [max(1, round(block / float(np.median(steps)))) for block in BLOCKS_S]
     tried = sorted(
         (_judged(base, fit, first, weight(base) - weight(fit), rows) for fit in fits),
         key=lambda t: -t.evidence,
@@ -170,13 +170,15 @@ def _surely(fit: ContactFit, independent: float) -> ContactFit:
 
 
 def _judged(
-    base: ContactFit, fit: ContactFit, first: int, gained: float, rows: int
+    base: ContactFit, fit: ContactFit, first: int, gained: float, rows: Sequence[int]
 ) -> LawTried:
     before, after = (_per_output(f.residuals[first:]) for f in (base, fit))
     errors = (_error(fit.residuals[:first]), _error(fit.residuals[first:]))
     was = (_error(base.residuals[:first]), _error(base.residuals[first:]))
     explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
-    significance = block_gain(base.residuals[first:], fit.residuals[first:], rows)
+    significance = max(
+        block_gain(base.residuals[first:], fit.residuals[first:], each) for each in rows
+    )
     held_gain = 1 - errors[1] / was[1]
     reasons = []
     if gained < EARNED:
