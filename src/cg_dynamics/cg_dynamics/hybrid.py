@@ -164,7 +164,7 @@ def swing_foot(q, stance: str, leg_length: float) -> tuple[float, float]:
 
 
 @dataclass
-class _Leg:
+class Leg:
     """A stance phase while it is being simulated.
 
     Attributes:
@@ -184,12 +184,19 @@ class _Leg:
     foot: list[np.ndarray] = field(default_factory=list)
 
     def add(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
+        """Keep an instant, its state and the inputs that act from it on."""
         self.time.append(t)
         self.states.append(x)
         self.inputs.append(u)
         self.foot.append(np.concatenate([self.place, self.rate]))
 
+    def forget(self) -> None:
+        """Keep nothing of what was so far."""
+        for kept in (self.time, self.states, self.inputs, self.foot):
+            kept.clear()
+
     def arc(self) -> Arc:
+        """The phase as far as it was kept."""
         return Arc(
             self.stance, np.array(self.time), np.array(self.states), np.array(self.inputs),
             self.mode, np.array(self.foot),
@@ -224,11 +231,13 @@ def walk(
     Raises:
         SimulationError: if the state runs away.
     """
-    walker = _Walker(model, options or WalkOptions(), command, law)
+    walker = Walker(model, options or WalkOptions(), command, law)
     return walker.run(stance, np.asarray(x0, float), duration, torques)
 
 
-class _Walker:
+class Walker:
+    """A robot that walks: what happens from one instant to the next; arguments as in `walk`."""
+
     def __init__(
         self,
         model: Model,
@@ -259,6 +268,7 @@ class _Walker:
         duration: float,
         torques: Sequence[tuple[float, float]] = (),
     ) -> Walk:
+        """A whole walk: see `walk`."""
         compiled = self.compiled[stance]
         # Torques on their way: (instant at which it acts, torque).
         latches = [(instant, self._inputs(torque)) for instant, torque in torques]
@@ -267,7 +277,7 @@ class _Walker:
             u = latches.pop(0)[1]
         if len(x) != compiled.nx:
             x = compiled.initial_state(x[:4], u, self.p)
-        leg, arcs, outcome = _Leg(stance, compiled), [], 'time'
+        leg, arcs, outcome = Leg(stance, compiled), [], 'time'
         t, tick = 0.0, 0
         while t < duration - INSTANT and outcome == 'time':
             if self.command is not None:
@@ -293,6 +303,33 @@ class _Walker:
         leg.add(t, x, u)
         return Walk((*arcs, leg.arc()), tuple(self.events), outcome)
 
+    def stand(self, stance: str) -> 'Leg':
+        """A stance phase that begins, its foot held."""
+        return Leg(stance, self.compiled[stance])
+
+    def move(
+        self, leg: 'Leg', x: np.ndarray, u: np.ndarray, duration: float
+    ) -> tuple['Leg', np.ndarray]:
+        """Move on with inputs held; nothing of it is kept but the end.
+
+        Args:
+            leg: The phase so far.
+            x: State, shape (nx,).
+            u: Inputs that act, shape (nu,).
+            duration: In s.
+
+        Returns:
+            The phase then, which may be another one, and its state.
+        """
+        t = 0.0
+        while t < duration - INSTANT:
+            steps = max(1, math.ceil((duration - t) / self.step - 1e-9))
+            t, x, event = self._one_step(leg, t, x, u, (duration - t) / steps)
+            if event is not None and event.kind not in ('scuff', 'fall'):
+                leg, x = self._after(event, leg, x, u)
+            leg.forget()
+        return leg, x
+
     def _inputs(self, torque) -> np.ndarray:
         extra = self.compiled['inner'].nu - 1
         return np.concatenate([np.array(torque, float).reshape(1), np.ones(extra)])
@@ -304,8 +341,8 @@ class _Walker:
         return 'steps' if impacts >= self.options.largest_steps else 'time'
 
     def _after(
-        self, event: Event, leg: _Leg, x: np.ndarray, u: np.ndarray
-    ) -> tuple[_Leg, np.ndarray]:
+        self, event: Event, leg: Leg, x: np.ndarray, u: np.ndarray
+    ) -> tuple[Leg, np.ndarray]:
         """The phase that an event begins, and its state."""
         t = self.ground.tangent
         if event.impact is not None:
@@ -316,7 +353,7 @@ class _Walker:
             rate = landed.landing_velocity
             if landed.mode != 'flight':
                 rate = (rate @ t) * t
-            new = _Leg(
+            new = Leg(
                 landed.stance, self.compiled[landed.stance], landed.mode, place, rate,
                 float(np.sign(rate @ t)),
             )  # fmt: skip
@@ -324,13 +361,13 @@ class _Walker:
         # Sliding keeps the foot on the ground but for rounding: take that away.
         place, slip = (leg.place @ t) * t, (leg.rate @ t) * t
         if event.kind == 'lift':
-            return _Leg(leg.stance, leg.compiled, 'flight', place, slip), x
+            return Leg(leg.stance, leg.compiled, 'flight', place, slip), x
         if event.kind == 'slip':
             sense = -float(np.sign(self._force(leg, x, u) @ t))
-            return _Leg(leg.stance, leg.compiled, 'slide', place, np.zeros(2), sense), x
-        return _Leg(leg.stance, leg.compiled, 'stick', place), x
+            return Leg(leg.stance, leg.compiled, 'slide', place, np.zeros(2), sense), x
+        return Leg(leg.stance, leg.compiled, 'stick', place), x
 
-    def _force(self, leg: _Leg, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def _force(self, leg: Leg, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.asarray(self._free(leg.stance).force(x, u, self.p)).ravel()
 
     def _free(self, stance: str) -> FreeFoot:
@@ -338,7 +375,7 @@ class _Walker:
             self.free[stance] = free_foot(self.model, stance)
         return self.free[stance]
 
-    def _cone(self, leg: _Leg, x: np.ndarray, u: np.ndarray) -> float:
+    def _cone(self, leg: Leg, x: np.ndarray, u: np.ndarray) -> float:
         """How far inside the cone of friction the force on a held foot is, in N."""
         if math.isinf(self.law.friction):
             return math.inf
@@ -353,7 +390,7 @@ class _Walker:
             )
         return self.answer
 
-    def _one_step(self, leg: _Leg, t: float, x: np.ndarray, u: np.ndarray, h: float):
+    def _one_step(self, leg: Leg, t: float, x: np.ndarray, u: np.ndarray, h: float):
         """One Runge-Kutta step, cut short where something happens."""
         leg.add(t, x, u)
         after = self._stepper(leg, x, u)
@@ -399,12 +436,12 @@ class _Walker:
         leg.place, leg.rate = self._foot(leg, y, nx)
         return t + h, y[:nx], None
 
-    def _foot(self, leg: _Leg, y: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
+    def _foot(self, leg: Leg, y: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray]:
         if leg.mode == 'stick':
             return leg.place, leg.rate
         return y[nx : nx + 2], y[nx + 2 :]
 
-    def _stepper(self, leg: _Leg, x: np.ndarray, u: np.ndarray) -> Callable[[float], np.ndarray]:
+    def _stepper(self, leg: Leg, x: np.ndarray, u: np.ndarray) -> Callable[[float], np.ndarray]:
         """Time in s -> x then, with place and velocity of the foot behind it if it is free."""
         if leg.mode == 'stick':
 
@@ -420,10 +457,10 @@ class _Walker:
         c, slope = self._grip(leg), self.options.slope
         return lambda part: np.asarray(move(start, u, self.p, part, c, slope)).ravel()
 
-    def _grip(self, leg: _Leg) -> float:
+    def _grip(self, leg: Leg) -> float:
         return self.law.friction * leg.sense if leg.mode == 'slide' else 0.0
 
-    def _guards(self, leg: _Leg, u: np.ndarray):
+    def _guards(self, leg: Leg, u: np.ndarray):
         standing, nx = STANCES.index(leg.stance), leg.compiled.nx
         n, t = self.ground.normal, self.ground.tangent
 
@@ -448,5 +485,6 @@ class _Walker:
 
 
 __all__ = [
-    'Arc', 'Command', 'ContactLaw', 'Event', 'Walk', 'WalkOptions', 'other', 'swing_foot', 'walk',
+    'Arc', 'Command', 'ContactLaw', 'Event', 'Leg', 'Walk', 'WalkOptions', 'Walker', 'other',
+    'swing_foot', 'walk',
 ]  # fmt: skip

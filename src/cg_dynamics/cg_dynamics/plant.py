@@ -3,7 +3,8 @@
 It stands where the hardware would stand. Unlike the rollouts of identification it integrates at a
 tenth of a millisecond or less, lets a delayed torque act at its exact instant, and reports what
 sensors report: noisy, late, in counts. A compass gait that is not on blocks walks: its swing foot
-lands (hybrid.py, (GUARD)), and the leg that stands changes.
+lands (hybrid.py, (GUARD)), and the leg that stands changes; where its model says so, the foot
+bounces and slides (contact.py).
 """
 
 import bisect
@@ -16,14 +17,16 @@ from scipy.optimize import brentq
 
 from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import compile_model
+from cg_dynamics.contact import contact_law
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import INSTANT, swing_foot
+from cg_dynamics.hybrid import INSTANT, Leg, Walker, WalkOptions, swing_foot
 from cg_dynamics.impact import impact, other
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
 FINE_STEP = 1e-4
+CONTACT_STEP = 5e-4  # where feet slide and fly, whose steps cost more and whose events are located
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,12 @@ class Plant:
         self._noise = [np.random.default_rng(stream) for stream in streams]
         self._jolt: ca.Function | None = None
         self._fine = min(FINE_STEP, self._compiled.largest_step / 4)
+        self._walker: Walker | None = None
+        self._leg: Leg | None = None
+        if self._walks and not contact_law(model).plastic:
+            options = WalkOptions(step=CONTACT_STEP, minimum_step=minimum_step)
+            self._walker = Walker(model, options, None)
+            self._leg = self._walker.stand(self.stance)
 
     @property
     def time(self) -> float:
@@ -151,6 +160,11 @@ class Plant:
             self._past.pop(0)
 
     def _move(self, u: np.ndarray, step: float, steps: int) -> None:
+        if self._walker is not None and self._leg is not None:
+            self._leg, self._x = self._walker.move(self._leg, self._x, u, step * steps)
+            if self._leg.stance != self.stance:
+                self._stands_on(self._leg.stance)
+            return
         before = self._x.copy()
         self._compiled.advance(self._x, u, self._p, step, steps)
         if not self._walks or not self._height(before) > 0 >= self._height(self._x):
@@ -168,10 +182,14 @@ class Plant:
         if reach <= self._minimum_step:
             return
         landed = impact(self.model, self.stance, x)
-        self.stance, self._x = landed.stance, landed.x_plus
-        self._compiled = compile_model(self.model, replace(self.setup, stance=self.stance))
-        self._jolt = None
+        self._x = landed.x_plus
+        self._stands_on(landed.stance)
         self._compiled.advance(self._x, u, self._p, (duration - instant) / steps, steps)
+
+    def _stands_on(self, stance: str) -> None:
+        self.stance = stance
+        self._compiled = compile_model(self.model, replace(self.setup, stance=stance))
+        self._jolt = None
 
     def _height(self, x: np.ndarray) -> float:
         return swing_foot(x, self.stance, self.model.values['leg_length'])[1]

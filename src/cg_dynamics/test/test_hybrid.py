@@ -5,7 +5,7 @@ import pytest
 
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.gait import GaitError, find_gait, section_coordinates, section_state
-from cg_dynamics.hybrid import WalkOptions, swing_foot, walk
+from cg_dynamics.hybrid import Walker, WalkOptions, swing_foot, walk
 from cg_dynamics.rig import STANCES
 
 # The classic passive walker: two point-mass legs of 5 kg at half of 1 m, 10 kg at the hip.
@@ -127,9 +127,7 @@ def test_impact_is_located_and_converges_with_the_order_of_the_integrator(walker
 
 
 def _walk_with_step(model, x0, options, step):
-    from cg_dynamics.hybrid import _Walker
-
-    walker = _Walker(model, options, None)
+    walker = Walker(model, options, None)
     walker.step = step
     return walker.run('inner', x0, 2.0)
 

@@ -59,6 +59,21 @@ def test_machine_off_its_blocks_lands_where_the_hybrid_model_does(bare, stance):
     assert contact[machine.stance] > 0 == contact[stance]
 
 
+@pytest.mark.parametrize(
+    'ground', [('impact_restitution', 'coefficient', 0.3), ('foot_slip', 'friction', 0.3)]
+)
+def test_machine_bounces_and_slides_as_the_hybrid_model_does(bare, ground):
+    effect, parameter, value = ground
+    model = bare.with_effect(effect, None, **{parameter: value})
+    machine = Plant(model, Setup(on_blocks=False), START)
+    expected = walk(model, 'inner', START, 0.4, None, WalkOptions(minimum_step=0.1))
+    assert {'flight', 'slide'} & {arc.mode for arc in expected.arcs}
+    for _ in range(200):
+        machine.advance()
+    assert machine.stance == expected.stance == 'outer'
+    np.testing.assert_allclose(machine.state, expected.state, atol=1e-7)
+
+
 def test_on_blocks_the_foot_passes(bare):
     machine = Plant(bare, Setup(stance='inner'), START)
     for _ in range(200):

@@ -8,8 +8,8 @@ Schur complement.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ FIRST_ITERATIONS = 2  # of the landings' own unknowns at a start
 LOOKED_AT = 4  # landings by which starts are compared
 SHIFTS = (1.5e-3, -1.5e-3, 3e-3, -3e-3)  # rad, of the ground's slope
 POOR = (1.15, 30.0)  # chi2/N between which another instant of the touchdown may be the better one
+FARTHEST = np.array([0.3, 0.3, 10.0, 10.0, 0.1])  # of a landing's own from its belief
 LONGEST = 0.7  # step of a coordinate
 DRIFT = 1e-3  # share of the cost above the noise that is a small change
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
@@ -49,6 +50,7 @@ class ContactTask:
         train: Landings to fit.
         held: Landings to judge on, of which only their own is fitted.
         sigma: Noise floor of each output, shape (ny,).
+        starts: Effect -> values from which to set out besides the library's own.
     """
 
     model: Model
@@ -57,6 +59,7 @@ class ContactTask:
     train: tuple[Passage, ...]
     held: tuple[Passage, ...]
     sigma: np.ndarray
+    starts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,13 @@ def fit_contact(task: ContactTask) -> ContactFit | str:
     Returns:
         The fit, or a sentence saying why there is none.
     """
-    fitter = _Fitter(task)
+    try:
+        return _fit(_Fitter(task), task)
+    except np.linalg.LinAlgError as error:
+        return f'{" and ".join(task.effects) or "the law"}: {error}'
+
+
+def _fit(fitter: '_Fitter', task: ContactTask) -> ContactFit | str:
     start = fitter.start()
     if start is None:
         return f'no landing can be simulated with {" and ".join(task.effects) or "the law"}'
@@ -167,6 +176,8 @@ class _Fitter:
         self, theta: np.ndarray, passage: Passage, own: np.ndarray
     ) -> np.ndarray | None:
         """Residuals over noise, those of the belief last; None where it runs away."""
+        if not (np.abs(own - passage.centre) < FARTHEST).all():
+            return None
         try:
             y = simulate_passage(self.task.model, passage, self.law(theta), own)
         except DynamicsError:
@@ -247,7 +258,10 @@ class _Fitter:
     def start(self) -> np.ndarray | None:
         """The best of the effects' starts, by a few landings."""
         task = self.task
-        grids = [LIBRARY[name].parameters[0].starts for name in task.effects]
+        grids = [
+            (*task.starts.get(name, ()), *LIBRARY[name].parameters[0].starts)
+            for name in task.effects
+        ]
         points = [self.coordinates(values) for values in _grid(grids)]
         if len(points) == 1:
             return points[0]

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cg_dynamics.contact import contact_law
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -46,6 +47,7 @@ from cg_sysid.diagnosis import (
     per_output,
     summary_of,
 )
+from cg_sysid.held_foot import held_by_friction
 from cg_sysid.imperfections import imperfect, with_imperfections
 from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
@@ -136,11 +138,32 @@ def diagnose(
     Raises:
         IdentificationError: if the records cannot be used with this model.
     """
-    options = options or Options()
+    options, progress = options or Options(), progress or (lambda *_: None)
     trials = [_led_in(trial) for trial in prepare(model, records)]
     train, held = split(trials, options.held)
-    search = _Search(model, train, held, options, progress or (lambda *_: None), executor)
-    return with_landings(search.run(), landings, search.carry_out, options.effects)
+
+    def answer(train: Sequence[Trial], held: Sequence[Trial]) -> Diagnosis:
+        search = _Search(model, train, held, options, progress, executor)
+        return with_landings(search.run(), landings, search.carry_out, options.effects)
+
+    found = answer(train, held)
+    if found.landings is None or 'foot_slip' not in found.landings.accepted:
+        return found
+    # Knowing the friction one knows better where the foot was held, and what that says.
+    sides = [
+        held_by_friction(
+            found.extended.model, side, fit.motions, contact_law(found.extended.model).friction,
+            float(np.median([landing.touchdown.slope for landing in landings])),
+        )
+        for side, fit in ((train, found.extended.train), (held, found.extended.held))
+    ]  # fmt: skip
+    same = all(len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
+               for a, b in zip(sides, (train, held), strict=True))  # fmt: skip
+    if same or not all(sides):
+        return found
+    again = answer(*sides)
+    better = again.landings is not None and again.landings.after.sum() < found.landings.after.sum()
+    return again if better else found
 
 
 def _led_in(trial: Trial) -> Trial:

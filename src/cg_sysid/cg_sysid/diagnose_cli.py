@@ -127,7 +127,7 @@ def work(options: argparse.Namespace) -> int:
         write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
-    cli.print_steps(Console(), intake.steps, len(intake.records))
+    cli.print_steps(Console(), intake.steps, intake.phases)
     show(Console(), facts, options.out, options.quiet)
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
 
@@ -191,7 +191,10 @@ def _options(
     held = None
     if options.held:
         names = [record.name for record in intake.records]
-        held = tuple(n for n in names if fnmatch.fnmatchcase(n, options.held))
+        held = tuple(
+            n for n in names
+            if any(fnmatch.fnmatchcase(x, options.held) for x in (n, intake.origin[n]))
+        )  # fmt: skip
         if not held or len(held) == len(names):
             raise ValueError(
                 f'--held {options.held!r} matches {"no" if not held else "every"} record; '

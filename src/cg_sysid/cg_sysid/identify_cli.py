@@ -95,7 +95,7 @@ def work(options: argparse.Namespace) -> int:
         identified_model(model, found, facts, intake).save(options.out / 'model.yaml')
         write_report(options.out)
     cli.print_left_out(facts)
-    cli.print_steps(Console(), intake.steps, len(intake.records))
+    cli.print_steps(Console(), intake.steps, intake.phases)
     show(Console(), facts, options.out, options.quiet)
     return 0
 

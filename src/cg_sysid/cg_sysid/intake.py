@@ -74,6 +74,11 @@ class Intake:
         """Name of a bag of a walking robot -> steps in it."""
         return dict(Counter(self.origin[landing.record.name] for landing in self.landings))
 
+    @property
+    def phases(self) -> int:
+        """Number of stance phases that those bags were cut into."""
+        return sum(self.origin[record.name] in self.steps for record in self.records)
+
 
 def take_in(
     bags: Sequence[str | Path],

@@ -21,14 +21,20 @@ from cg_sysid.diagnosis import MARGIN
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.impulse import measure_impulse
 from cg_sysid.jury import AT_NOISE, EARNED, FIDELITY, MATERIAL, SIGNIFICANT
-from cg_sysid.landed import Landings, LawTried
-from cg_sysid.landings import Passage, ready
+from cg_sysid.landed import Impulse, Landings, LawTried
+from cg_sysid.landings import Passage, lasting, ready
 from cg_sysid.phases import Landing
 
 MOST = 12  # landings that are fitted, and as many that judge
 FEWEST = 2  # of each
-BLOCK_S = 0.025  # blocks on which a gain is tested
+# Blocks on which a gain is tested: short where landings are few, long where a gain is small.
+BLOCKS_S = (0.025, 0.05, 0.1, 0.3)
+# A rebound of a tenth lasts for ten milliseconds and explains about one standard deviation.
+NOTICEABLE = 0.5
 LEFT = 0.35  # share of the error above the noise that an accepted law may leave
+GIVEN = 0.005  # share of a value that the numbers of the model, taken as given, may be worth
+SURE = 5.0  # standard deviations from which an impulse is known
+ON_CONE = 0.8  # quantile of the slants of impulses that lies on the cone if there is one
 TOO_SMALL = 2.0  # standard deviations within which a rebound may be none at all
 
 Run = Callable[[Callable, list[tuple], str], list]
@@ -50,6 +56,7 @@ def judge_landings(
         run: Runs a function on tuples of arguments, here or elsewhere.
         effects: Names of the effects to try; by default all.
     """
+    model = lasting(model)
     passages = ready(model, landings, sigma)
     train, held = _split(passages)
     if min(len(train), len(held)) < FEWEST:
@@ -62,13 +69,15 @@ def judge_landings(
     present = {effect.label for effect in model.effects}
     names = [n for n in FREE if n not in present and (effects is None or n in effects)]
     fits: list[ContactFit] = []
+    believed = _impulses(task, passages, [passage.centre for passage in passages])
+    task = replace(task, starts=_starts(believed))
     if not _at_noise(base, len(train)):
         fits = _fits(run, task, [(name,) for name in names])
         best = min((f for f in fits), key=lambda f: f.chi2, default=None)
         # A little that is left is the ground's own softness, or the model's numbers.
         if best is not None and len(names) > 1 and _error(best.residuals) > (1 + MATERIAL) ** 2:
             fits += _fits(run, task, [tuple(names)])
-    return _verdict(task, base, fits, len(landings))
+    return _verdict(task, base, fits, len(landings), believed)
 
 
 def _split(
@@ -96,7 +105,11 @@ def _fits(run: Run, task: ContactTask, effects: Sequence[tuple[str, ...]]) -> li
 
 
 def _verdict(
-    task: ContactTask, base: ContactFit, fits: Sequence[ContactFit], found: int
+    task: ContactTask,
+    base: ContactFit,
+    fits: Sequence[ContactFit],
+    found: int,
+    believed: Sequence[Impulse],
 ) -> Landings:
     passages = (*task.train, *task.held)
     first = len(task.train)
@@ -110,7 +123,7 @@ def _verdict(
     def weight(fit: ContactFit) -> float:
         return evidence(fit.chi2, fit.samples, independent, len(fit.effects), fit.belief)
 
-    rows = max(1, round(BLOCK_S / float(np.median(steps))))
+    rows = [max(1, round(block / float(np.median(steps)))) for block in BLOCKS_S]
     tried = sorted(
         (_judged(base, fit, first, weight(base) - weight(fit), rows) for fit in fits),
         key=lambda t: -t.evidence,
@@ -128,6 +141,9 @@ def _verdict(
     ]  # fmt: skip
     names = accepted.effects if accepted else ()
     final = next((f for f in fits if f.effects == names), base)
+    # A law that explains the landings knows their instants better than the poses do.
+    known = _error(final.residuals) < (1 + MATERIAL) ** 2
+    impulses = _impulses(task, passages, final.own) if known else believed
     return Landings(
         found=found,
         judged=len(passages),
@@ -138,32 +154,40 @@ def _verdict(
         before=_per_output(base.residuals[first:]),
         after=_per_output(final.residuals[first:]),
         independent=independent,
-        impulses=tuple(_impulses(task, final, passages)),
+        impulses=tuple(impulses),
     )
 
 
 def _surely(fit: ContactFit, independent: float) -> ContactFit:
     factor = float(np.sqrt(max(1.0, fit.samples / independent)))
-    return replace(fit, values={n: (v, factor * s) for n, (v, s) in fit.values.items()})
+    return replace(
+        fit,
+        values={
+            name: (value, float(np.hypot(factor * sigma, GIVEN * value)))
+            for name, (value, sigma) in fit.values.items()
+        },
+    )
 
 
 def _judged(
-    base: ContactFit, fit: ContactFit, first: int, gained: float, rows: int
+    base: ContactFit, fit: ContactFit, first: int, gained: float, rows: Sequence[int]
 ) -> LawTried:
     before, after = (_per_output(f.residuals[first:]) for f in (base, fit))
     errors = (_error(fit.residuals[:first]), _error(fit.residuals[first:]))
     was = (_error(base.residuals[:first]), _error(base.residuals[first:]))
     explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
-    significance = block_gain(base.residuals[first:], fit.residuals[first:], rows)
+    significance = max(
+        block_gain(base.residuals[first:], fit.residuals[first:], each) for each in rows
+    )
     held_gain = 1 - errors[1] / was[1]
     reasons = []
     if gained < EARNED:
         reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
     if significance < SIGNIFICANT or held_gain <= 0:
         reasons.append('no significant gain on landings held out')
-    elif explained < MATERIAL:
+    elif explained < NOTICEABLE:
         reasons.append(f'explains {explained:.2f} noise standard deviations, '
-                       f'{MATERIAL:g} needed')
+                       f'{NOTICEABLE:g} needed')
     left = max(errors[1] - 1, 0.0)
     if left > LEFT * max(was[1] - 1, 0.0) and errors[1] > AT_NOISE:
         reasons.append(f'leaves an error of {np.sqrt(errors[1]):.1f} noise standard deviations')
@@ -208,11 +232,28 @@ def _error(residuals: Sequence[np.ndarray]) -> float:
     return float(np.nanmean(np.vstack(residuals) ** 2))
 
 
-def _impulses(task: ContactTask, fit: ContactFit, passages: Sequence[Passage]):
-    for passage, own in zip(passages, fit.own, strict=True):
+def _impulses(
+    task: ContactTask, passages: Sequence[Passage], owns: Sequence[np.ndarray]
+) -> list[Impulse]:
+    """What the jumps of the rates say by themselves, given what each landing has of its own."""
+    found = []
+    for passage, own in zip(passages, owns, strict=True):
         try:
-            found = measure_impulse(task.model, passage, fit.law, own, task.sigma)
+            impulse = measure_impulse(task.model, passage, task.law, own, task.sigma)
         except DynamicsError:
             continue
-        if found is not None:
-            yield found
+        found += [impulse] if impulse is not None else []
+    return found
+
+
+def _starts(impulses: Sequence[Impulse]) -> dict[str, tuple[float, ...]]:
+    """A first guess of the friction: where feet slide, impulses lie on the cone."""
+    slanted = [
+        abs(i.measured[0]) / i.measured[1]
+        for i in impulses
+        if i.measured[1] > SURE * np.sqrt(i.covariance[1, 1])
+    ]
+    if not slanted:
+        return {}
+    p = LIBRARY['foot_slip'].parameters[0]
+    return {'foot_slip': (float(np.clip(np.quantile(slanted, ON_CONE), 0.05, 0.9 * p.upper)),)}

@@ -2,8 +2,9 @@
 
 Where a foot bounces or slides after a touchdown, or slips before the next one, the pinned model
 says nothing: there short pieces are explained far worse than elsewhere in the record, and they
-belong to no phase. The model is identified first, from a rough cut: a robot that carries a payload
-is not one that slides. A record without a touchdown is left as it is.
+belong to no phase. The model is identified first, from the middles of the phases and then from a
+rough cut: a robot that carries a payload is not one that slides. A record without a touchdown is
+left as it is.
 """
 
 from collections.abc import Sequence
@@ -24,8 +25,9 @@ from cg_sysid.unknowns import IdentificationError
 PIECE_S = 0.08  # length of the pieces that are compared
 STRIDE_S = 0.01  # from one of them to the next
 GUARD_S = 0.008  # on both sides of a touchdown, whose instant is known to some samples
-ROUGHLY = 20.0  # times the usual error from which a piece is not that of a foot that is held
-WORSE = 4.0  # the same once the model's numbers are those of these records
+UPRIGHT = 0.13  # rad from the ground's normal within which almost any ground holds a foot
+ROUGHLY = 12.0  # times the usual error from which a piece is not that of a foot that is held
+WORSE = 4.0  # the same once the model's numbers are those of these phases
 FAR = 2.0  # times that limit, far from any touchdown
 AFTER_S = 0.4  # s after a touchdown in which a foot may slide, and `BEFORE_S` before the next
 BEFORE_S = 0.25
@@ -81,7 +83,9 @@ def cut_steps(records: Sequence[Record], model: Model | None) -> Cut:
     walking = [record for record in records if touchdowns[record.name]]
     if model is None or not walking:
         return Cut(tuple(records), (), {record.name: record.name for record in records})
-    rough = [_cut(r, touchdowns[r.name], model, ROUGHLY)[0] for r in walking]
+    middles = [_middles(record, touchdowns[record.name]) for record in walking]
+    better = _identified(model, [phase for phases in middles for phase in phases])
+    rough = [_cut(r, touchdowns[r.name], better, ROUGHLY)[0] for r in walking]
     better = _identified(model, [phase for phases in rough for phase in phases])
     found: list[Record] = []
     landings: list[Landing] = []
@@ -95,15 +99,31 @@ def cut_steps(records: Sequence[Record], model: Model | None) -> Cut:
     return Cut(tuple(found), tuple(landings), origin)
 
 
+def _middles(record: Record, touchdowns: Sequence[Touchdown]) -> list[Record]:
+    """The middle of each phase: about upright the ground holds a foot if it ever does."""
+    stances = [*(t.stance for t in touchdowns), other(touchdowns[-1].stance)]
+    edges = [0.0, *(t.time for t in touchdowns), record.duration]
+    time, inner = record.samples('imu_angle')
+    _, hip = record.samples('hip_angle')
+    between = np.interp(time, record.samples('hip_angle')[0], hip)
+    found = []
+    for stance, (a, b) in zip(stances, pairwise(edges), strict=True):
+        lean = inner if stance == 'inner' else inner - between
+        inside = (time > a + GUARD_S) & (time < b - GUARD_S)
+        run = longest_run(inside & (np.abs(lean - touchdowns[0].slope) < UPRIGHT))
+        if run is not None and time[run[1]] - time[run[0]] >= SHORTEST_S:
+            found.append(_phase(record, stance, float(time[run[0]]), float(time[run[1]])))
+    return found
+
+
 def _identified(model: Model, phases: Sequence[Record]) -> Model:
     """The model with the numbers of these phases: what it lacks shows least in it.
 
     A phase that is one slide from end to end would pull all numbers its way: those that are left
     far behind are let go.
     """
-    trials = prepare(model, phases)
-    better = model
-    for _ in range(TRIMMINGS):
+    better, trials = model, prepare(model, phases) if phases else []
+    for _ in range(TRIMMINGS if trials else 0):
         try:
             found = fit(model, trials, iterations=ITERATIONS)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
@@ -156,7 +176,7 @@ def _held(
         usual = max(1.0, float(np.nanquantile(np.concatenate(alike), 0.25))) if alike else 1.0
         # What is a little wrong far from any touchdown is wrong with the model.
         far = (begin > edges[k] + AFTER_S) & (begin + PIECE_S < edges[k + 1] - BEFORE_S)
-        run = _longest(~(error > usual * np.where(far, FAR * worse, worse)))
+        run = longest_run(~(error > usual * np.where(far, FAR * worse, worse)))
         span = None
         # Of a phase that is a slide for the most part nothing is kept.
         if run is not None and run != (0, len(begin) - 1):
@@ -172,7 +192,7 @@ def _held(
     return found
 
 
-def _longest(fine: np.ndarray) -> tuple[int, int] | None:
+def longest_run(fine: np.ndarray) -> tuple[int, int] | None:
     """First and last index of the longest run of True; None where there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], fine, [False]]).astype(int)))
     if not len(edges):
