@@ -52,7 +52,7 @@ from cg_sysid.imperfections import imperfect, with_imperfections
 from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
-from cg_sysid.phases import Landing
+from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.record import Record
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
@@ -123,7 +123,7 @@ def diagnose(
     options: Options | None = None,
     progress: Progress | None = None,
     executor: Executor | None = None,
-    landings: Sequence[Landing] = (),
+    landings: Sequence[Landing] | None = None,
 ) -> Diagnosis:
     """Say what a model gets wrong about records of its machine.
 
@@ -133,12 +133,16 @@ def diagnose(
         options: How.
         progress: Called with (what, done, total).
         executor: Where candidates are fitted; by default local processes.
-        landings: What lies between the phases of walking records (phases.cut_steps).
+        landings: What lies between records that are phases of walking ones (phases.cut_steps); by
+            default the records are cut here.
 
     Raises:
         IdentificationError: if the records cannot be used with this model.
     """
     options, progress = options or Options(), progress or (lambda *_: None)
+    if landings is None:
+        cut = cut_steps(records, model)
+        records, landings = cut.records, cut.landings
     trials = [_led_in(trial) for trial in prepare(model, records)]
     train, held = split(trials, options.held)
 
