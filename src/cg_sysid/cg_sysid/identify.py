@@ -31,10 +31,6 @@ BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
-UPHILL = 3.0  # ratio of costs up to which a step uphill is followed by one across the valley
-ACROSS = 1e-3  # damping of that: flat directions stay where they are
-PROMISED = 10.0  # times that gain, which a full step may still promise where a fit has converged
-HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 
 
@@ -214,36 +210,25 @@ def _minimise(
     # border early creeps along it ever after.
     barrier = max(BARRIER, CENTRAL * min(_promised(point), point.cost))
     point = point.beside(BARRIER, barrier)
-
-    def ahead(theta, motions, point, damping):
-        """A damped Gauss-Newton step from a point: where it leads, and the point there."""
+    for _ in range(iterations):
         _, gradient, _ = reduced(point, 0.0)
         frozen = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
         if leading:
             frozen |= _unseen(problem, theta, point, weight)
         step, factors = _step(point, damping, frozen)
-        reached = np.clip(theta + _straight(problem, step), lower, upper)
-        step = reached - theta
+        trial_theta = np.clip(theta + step, lower, upper)
+        step = trial_theta - theta
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
-        moved = [m + d for m, d in zip(motions, moves, strict=True)]
-        there = evaluate(problem, reached, moved, horizon, weight)
-        return reached, moved, there.beside(BARRIER, barrier) if there is not None else None
-
-    for _ in range(iterations):
-        trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
-        if candidate is not None and point.cost < candidate.cost < UPHILL * point.cost:
-            # A step along a curved valley leaves its floor: back to it, across the valley.
-            back = ahead(trial_theta, trial_motions, candidate, max(ACROSS, damping))
-            if back[2] is not None and back[2].cost < point.cost:
-                trial_theta, trial_motions, candidate = back
+        trial_motions = [m + d for m, d in zip(motions, moves, strict=True)]
+        candidate = evaluate(problem, trial_theta, trial_motions, horizon, weight)
+        if candidate is not None:
+            candidate = candidate.beside(BARRIER, barrier)
         if candidate is not None and candidate.cost < point.cost:
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
             damping = max(damping / 10, 1e-9)
             small = max(drift * candidate.cost, SMALL_GAIN)
-            little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
-            # A short step gains little too.
-            if little and _promised(point) < PROMISED * small:
+            if gain < small and barrier <= max(BARRIER, CENTRAL * small):
                 return theta, motions, point.beside(barrier, BARRIER), True
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier
@@ -255,17 +240,6 @@ def _minimise(
                 # No step is short enough: a minimum, or a corner of what bodies can be.
                 return theta, motions, point.beside(barrier, BARRIER), candidate is not None
     return theta, motions, point.beside(barrier, BARRIER), False
-
-
-def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:
-    """A step along which the values of logarithmic unknowns change by what it says at its start.
-
-    Stiffness and inertias make up for each other in proportion to their values: in logarithms
-    the valley of the cost would be curved.
-    """
-    logarithmic = np.array([u.logarithmic for u in problem.unknowns], bool)
-    factor = np.log1p(np.maximum(step, -HALF))
-    return np.where(logarithmic, np.where(step > -HALF, factor, factor + 2 * (step + HALF)), step)
 
 
 def _promised(point: Point) -> float:

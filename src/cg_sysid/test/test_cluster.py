@@ -231,7 +231,8 @@ def test_the_command_line_fits_on_the_cluster_and_can_be_interrupted(
             [sys.executable, '-m', 'cg_sysid.diagnose_cli', *words, *map(str, bags)],
             env=processes.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        until(lambda: working(client))
+        # Asked of the scheduler: a worker at a fit may answer only when all is over.
+        until(lambda: tasks(client))
         program.send_signal(signal.SIGINT)
         out, err = program.communicate(timeout=LONG)
         assert (program.returncode, out, err) == (130, '', 'diagnose: interrupted\n')

@@ -106,6 +106,3 @@ def test_found_where_the_first_seconds_mislead(model_file, effect, values):
     outcome = try_candidate(Task(nominal, (effect, None)), train, [held])
     # Noise alone gives 1, within a few percent at a thousand rows.
     assert outcome.held.normalised_error < 1.2
-    for name, value in values.items():
-        found, sigma, _ = own_parameters(outcome)[name]
-        assert abs(found - value) < 4.0 * sigma, name
