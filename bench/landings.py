@@ -1,6 +1,6 @@
 """Landings hidden in walking records: what the diagnosis says of the ground.
 
-    python bench/landings.py --seeds 5 6 --cases plastic e0.3 mu0.25
+    ./cg exec python bench/landings.py --seeds 5 6 --cases plastic e0.3 mu0.25
 
 Six walks of 4 s down a slope of 0.05 rad (src/cg_dynamics/test/walking.py: a finer step, noise,
 counts, stamps that jitter) on machines whose numbers are 10 to 20 % off. Writes a table.
