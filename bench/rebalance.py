@@ -20,6 +20,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from hidden_effects import PROGRAMME
 
 from cg_control.balance import BalanceSettings, balance_gains
 from cg_control.collocation import Options, PlanningError
@@ -48,12 +49,6 @@ SLOPES = (-0.045, -0.03, -0.015, 0.015, 0.03, 0.045)
 OPTIONS = WalkOptions(
     sample_time=SAMPLE_TIME, step=0.002, minimum_step=0.1, fall_angle=0.6, largest_steps=2
 )
-PROGRAMME = (
-    'spring_stabilised_inner',
-    'spring_stabilised_outer',
-    'swing_inner_fixed',
-    'swing_outer_fixed',
-) * 2
 RECORDED = 6.0  # s of each
 RESULT = Path(__file__).parent / 'results' / 'rebalance.md'
 

@@ -113,14 +113,17 @@ def kill_while_sending(bag, seconds):
 
 
 def test_sigkill_loses_at_most_20_ms(tmp_path):
-    # A machine that takes the processor from both for longer says nothing about the recorder.
+    # A machine that takes the processor from both delays the sender as well, and what was not
+    # sent is not lost: the best of some attempts is what the recorder can do.
+    excess = []
     for attempt in range(10):
         loss, worst = kill_while_sending(tmp_path / f'bag{attempt}', 0.5 + 0.0037 * attempt)
         print(f'lost {1e3 * loss:.1f} ms, sender late by at most {1e3 * worst:.1f} ms')
         if worst < 0.004:
             assert loss <= LOSS
             return
-    pytest.skip('the machine was too busy to send at 500 Hz in ten attempts')
+        excess.append(loss - worst)
+    assert min(excess) <= LOSS
 
 
 def test_sigint_closes_the_bag_and_every_message_is_there(tmp_path):
