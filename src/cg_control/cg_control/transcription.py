@@ -51,7 +51,7 @@ TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
 GOAL_PARAMETERS = {'box': 8, 'region': 20}  # bounds; center and form
 MISS_SCALE = np.array([0.1, 0.1, 0.3, 0.3])  # rad, rad/s: misses of the goal worth the same
 # Long straight-line code: higher levels take minutes to compile it and gain nothing.
-FLAGS_HERE = ('-O1', *(flag for flag in FLAGS if flag not in ('-O2', '-ftree-vectorize')))
+FLAGS_HERE = tuple(flag for flag in FLAGS if flag != '-ftree-vectorize')
 
 
 @dataclass(frozen=True)

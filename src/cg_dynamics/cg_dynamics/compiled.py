@@ -29,9 +29,10 @@ from cg_dynamics.rig import Setup
 
 log = logging.getLogger(__name__)
 
+# -O2 takes a third longer to compile, hundreds of times in a diagnosis, and runs no faster.
 # No -ffast-math: runaway states are found by comparisons that must see NaN.
 FLAGS = (
-    '-O2', '-ftree-vectorize', '-march=native', '-fno-math-errno', '-fno-trapping-math',
+    '-O1', '-ftree-vectorize', '-march=native', '-fno-math-errno', '-fno-trapping-math',
     '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math', '-ffp-contract=fast',
     '-shared', '-fPIC',
 )  # fmt: skip
@@ -187,7 +188,12 @@ class CompiledModel:
         return mean, slope
 
     def simulate(
-        self, time: np.ndarray, u: np.ndarray, x0: np.ndarray, p: np.ndarray
+        self,
+        time: np.ndarray,
+        u: np.ndarray,
+        x0: np.ndarray,
+        p: np.ndarray,
+        refinement: float = 1.0,
     ) -> np.ndarray:
         """States at the rows, shape (n, nx), from x0 under held inputs.
 
@@ -196,6 +202,7 @@ class CompiledModel:
             u: Inputs, each held until the next row, shape (n, nu), N m.
             x0: State at the first row, shape (nx,).
             p: Parameter vector (assemble.parameter_vector), shape (np,).
+            refinement: Integration steps in place of one of `step_for`.
 
         Raises:
             SimulationError: if the state runs away.
@@ -204,9 +211,8 @@ class CompiledModel:
         late, _ = self.delayed_inputs(time, u, self.delays(p)[0])
         late = _array(late)
         states = np.empty((len(time), self.nx))
-        rows = self._c.cgm_simulate(
-            len(time), _array(np.diff(time)), self.step_for(x0, u, p), late, x0, p, states
-        )
+        step = self.step_for(x0, u, p) / refinement
+        rows = self._c.cgm_simulate(len(time), _array(np.diff(time)), step, late, x0, p, states)
         if rows < len(time):
             raise SimulationError(
                 f'the state runs away after {time[rows - 1] - time[0]:.3f} s', time[rows - 1]
@@ -245,6 +251,7 @@ class CompiledModel:
         measured: np.ndarray,
         weight: np.ndarray,
         keep: bool = False,
+        refinement: float = 1.0,
     ) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
         """Normal equations of the simulation error of one record (Eq. 4.13).
 
@@ -258,6 +265,7 @@ class CompiledModel:
             measured: Outputs, NaN where there is no sample, shape (n, ny).
             weight: 1 / standard deviation of each output, shape (ny,).
             keep: Return the simulated outputs and the Jacobian too.
+            refinement: Integration steps in place of one of `step_for`.
         """
         time, u, x0, p = self._checked(time, u, x0, p)
         n, nc = len(time), np.shape(s0)[1]
@@ -280,8 +288,8 @@ class CompiledModel:
         y = np.full((n, self.ny), np.nan) if keep else None
         j = np.zeros((n, self.ny, nc)) if keep else None
         rows = self._c.cgm_normal(
-            n, time, self.step_for(x0, u, p), _array(late), _array(slope), delay_columns[0],
-            x0, s0, p, nc, column, measured, weight, _array(output_delays),
+            n, time, self.step_for(x0, u, p) / refinement, _array(late), _array(slope),
+            delay_columns[0], x0, s0, p, nc, column, measured, weight, _array(output_delays),
             np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip

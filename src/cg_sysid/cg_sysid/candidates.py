@@ -24,6 +24,7 @@ MOST_STARTS = 24
 FOLLOWED = 3  # starts that are worth a second look
 FOLLOWING = 8  # iterations of each, before the best of them is chosen
 SAME = 1.01  # ratio of the errors of two fits that may be one minimum
+ALIKE = 0.1  # relative difference of an effect's parameters there
 SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
 WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
 SETTLED = 1.2  # chi2/N at which nothing is left to find
@@ -45,6 +46,7 @@ class Task:
         leads: Go on from the best of these fits, the most promising first; without any from
             the effect's own starts.
         iterations: Limit for whole records.
+        thorough: Fit whole records down to the very bottom (identify.fit).
     """
 
     model: Model
@@ -53,6 +55,7 @@ class Task:
     bounds: Bounds = field(default_factory=dict)
     leads: tuple[Fit, ...] = ()
     iterations: int = ITERATIONS
+    thorough: bool = False
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     label, task = _label(task), _unbound(task)
     longest = max(trial.duration for trial in train)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if _eventful(task) or late or longest < 2 * SCREEN_S:
+    if eventful(task) or late or longest < 2 * SCREEN_S:
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
@@ -168,11 +171,11 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         if best.own:
             known = {t.name: task.events[t.name] for t in held if t.name in task.events}
             events |= known or seek_events(best.model, held, _surest(best))
-        held_score = score(best.model, held, own=events)
+        held_score = score(best.model, held, own=events, thorough=task.thorough)
         events |= _events_of(held_score, held)
         model = believing(best.model, task.model, label)
         residuals = tuple(
-            (predict(best.model, trial, motion) - trial.outputs) / trial.sigma
+            (predict(best.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
             for trial, motion in zip(
                 (*train, *held), (*best.motions, *held_score.motions), strict=True
             )
@@ -222,7 +225,7 @@ def cost_of(task: Task) -> int:
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    if _eventful(task):
+    if eventful(task):
         return _event_fit(task, train)
     model, leads = next(_starting_models(task)), task.leads
     if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
@@ -246,11 +249,12 @@ def _whole(
 ) -> Fit:
     """Fit whole records."""
     return fit(
-        model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations
-    )
+        model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
+        thorough=task.thorough,
+    )  # fmt: skip
 
 
-def _eventful(task: Task) -> bool:
+def eventful(task: Task) -> bool:
     """Whether the effect is one of which every record has its own."""
     return own_unknowns(task.model) != own_unknowns(next(_starting_models(task)))
 
@@ -264,10 +268,16 @@ def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
         # Let go of the frequency only where a fit at its start is promising.
         looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
     leads: list[Fit] = []
-    for look, _ in looks:
-        if not leads or look.normalised_error > SAME * leads[-1].normalised_error:
+    for look, model in looks:
+        if not any(_one_minimum(look, lead, model.effects[-1].label) for lead in leads):
             leads.append(look)
     return tuple(leads[:FOLLOWED])
+
+
+def _one_minimum(a: Fit, b: Fit, label: str) -> bool:
+    own = [u.name.startswith(f'{label}.') for u in a.unknowns]
+    near = a.normalised_error < SAME * b.normalised_error
+    return near and np.allclose(a.values[own], b.values[own], rtol=ALIKE)
 
 
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:

@@ -68,6 +68,7 @@ MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be t
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
+THOROUGH_ITERATIONS = 72  # of the last fit
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int], None]
@@ -241,6 +242,25 @@ class _Search:
         again = self._fit([task], f'{o.label} again')
         better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
         return replace(better[0], label=o.label) if better else o
+
+    def _thorough(self, o: Outcome) -> Outcome:
+        """The last fit of what was found: its values are what people will use.
+
+        After all contests, in which one thorough fit would have the advantage.
+        """
+        task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
+                    iterations=THOROUGH_ITERATIONS)  # fmt: skip
+        tasks = [replace(task, leads=(o.train,))]
+        for label in self._added(o):
+            # Near the noise no contest asked whether another start leads deeper.
+            effect = o.model.effect(label)
+            without = replace(task, model=o.model.without_effect(label))
+            look = look_at(replace(without, effect=(effect.name, effect.at)), self.train)
+            if isinstance(look, Look):
+                tasks += [replace(look.task, leads=(lead,)) for lead in look.task.leads]
+        found = [f for f in self._fit(tasks, 'values of what was found') if isinstance(f, Outcome)]
+        best = min([o, *found], key=chi2)
+        return replace(best, label=o.label)
 
     def _with_small_faults(self, o: Outcome) -> Outcome:
         """The same with what every robot has a little of, if that explains anything."""
@@ -457,7 +477,10 @@ class _Search:
                 nominal, final, self._added(final), self.train, self.held, self.carry_out
             )
             final = final if stand else nominal
-        causes, left = self._causes(nominal, final), self._left(final)
+        causes = self._causes(nominal, final)
+        final = self._thorough(final)
+        causes = [_as_in(final, cause) for cause in causes]
+        left = self._left(final)
         if not causes:
             verdict = 'unexplained' if left else 'consistent'
         elif any(cause.rivals for cause in causes):
@@ -512,6 +535,13 @@ def _small_faults(o: Outcome) -> list[str]:
                     f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
                 )
     return found
+
+
+def _as_in(final: Outcome, cause: Cause) -> Cause:
+    """The cause with the values of another fit."""
+    return replace(
+        cause, parameters=parameters_of(final, cause.label), events=events_of(final, cause.label)
+    )
 
 
 def _cause(final: Outcome, label: str, contest: Contest) -> Cause:

@@ -32,6 +32,11 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+UPHILL = 3.0  # ratio of costs up to which a step uphill is followed by one across the valley
+ACROSS = 1e-3  # damping of that: flat directions stay where they are
+HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
+REFINED = 4.0  # integration steps of a thorough fit in place of one
+THOROUGH_ITERATIONS = 24  # of a thorough fit between two sets of weights
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,7 @@ class Fit:
         horizon: Length of the records used, in s.
         evaluations: Number of evaluations of all records.
         seconds: Wall time.
+        refinement: Integration steps that were taken in place of one.
         converged: False if it stopped at the limit of iterations.
         warnings: What a person should know: bounds, correlations, unidentifiable directions.
     """
@@ -75,6 +81,7 @@ class Fit:
     horizon: float
     evaluations: int
     seconds: float
+    refinement: float
     converged: bool
     warnings: tuple[str, ...] = ()
 
@@ -103,6 +110,7 @@ def fit(
     at: Mapping[str, float] | None = None,
     own: Mapping[str, np.ndarray] | None = None,
     bounds: Mapping[str, float] | None = None,
+    thorough: bool = False,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -118,6 +126,9 @@ def fit(
         own: Name of a trial -> first guess of what it has of its own beyond its initial motion
             (`own_unknowns`); without one the model's values are the guess.
         bounds: Parameters that stay near the model's value (`unknowns_of`).
+        thorough: Down to the very bottom, at several times the cost: along curved valleys, until
+            a tenth of a squared standard deviation is all that is left to gain, with finer
+            integration. For values that are to be as good as their intervals say.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -126,7 +137,8 @@ def fit(
         raise IdentificationError('no record to identify from; at least one is needed')
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only, bounds)
-    problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}))
+    refinement = REFINED if thorough else 1.0
+    problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}), refinement)
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motions = list(problem.guesses if start is None else start.motions)
@@ -139,9 +151,10 @@ def fit(
         if found[2] is not None:
             theta, motions = found[0], found[1]
             weight = _weight(found[2]) if reweight else 1.0
-    for _ in range(max(1, iterations // BETWEEN_WEIGHTS)):
+    at_once = THOROUGH_ITERATIONS if thorough else BETWEEN_WEIGHTS
+    for _ in range(max(1, iterations // at_once)):
         theta, motions, point, converged = _minimise(
-            problem, theta, motions, longest, weight, BETWEEN_WEIGHTS, DRIFT
+            problem, theta, motions, longest, weight, at_once, DRIFT, thorough=thorough
         )
         if point is None:
             raise IdentificationError(
@@ -175,6 +188,7 @@ def fit(
         horizon=longest,
         evaluations=problem.evaluations,
         seconds=clock.perf_counter() - began,
+        refinement=refinement,
         converged=converged,
     )
     return replace(result, warnings=tuple(_warnings(result, bounds or ())))
@@ -198,6 +212,7 @@ def _minimise(
     iterations: int,
     drift: float,
     leading: bool = False,
+    thorough: bool = False,
 ) -> tuple[np.ndarray, list[np.ndarray], Point | None, bool]:
     lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
                       for u in problem.unknowns])
@@ -210,25 +225,40 @@ def _minimise(
     # border early creeps along it ever after.
     barrier = max(BARRIER, CENTRAL * min(_promised(point), point.cost))
     point = point.beside(BARRIER, barrier)
-    for _ in range(iterations):
+
+    def ahead(theta, motions, point, damping):
+        """A damped Gauss-Newton step from a point: where it leads, and the point there."""
         _, gradient, _ = reduced(point, 0.0)
         frozen = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
         if leading:
             frozen |= _unseen(problem, theta, point, weight)
         step, factors = _step(point, damping, frozen)
-        trial_theta = np.clip(theta + step, lower, upper)
-        step = trial_theta - theta
+        reached = np.clip(theta + (_straight(problem, step) if thorough else step), lower, upper)
+        step = reached - theta
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
-        trial_motions = [m + d for m, d in zip(motions, moves, strict=True)]
-        candidate = evaluate(problem, trial_theta, trial_motions, horizon, weight)
-        if candidate is not None:
-            candidate = candidate.beside(BARRIER, barrier)
+        moved = [m + d for m, d in zip(motions, moves, strict=True)]
+        there = evaluate(problem, reached, moved, horizon, weight)
+        return reached, moved, there.beside(BARRIER, barrier) if there is not None else None
+
+    for _ in range(iterations):
+        trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
+        if (
+            thorough
+            and candidate is not None
+            and point.cost < candidate.cost < UPHILL * point.cost
+        ):
+            # A step along a curved valley leaves its floor: back to it, across the valley.
+            back = ahead(trial_theta, trial_motions, candidate, max(ACROSS, damping))
+            if back[2] is not None and back[2].cost < point.cost:
+                trial_theta, trial_motions, candidate = back
         if candidate is not None and candidate.cost < point.cost:
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
             damping = max(damping / 10, 1e-9)
-            small = max(drift * candidate.cost, SMALL_GAIN)
-            if gain < small and barrier <= max(BARRIER, CENTRAL * small):
+            small = SMALL_GAIN if thorough else max(drift * candidate.cost, SMALL_GAIN)
+            little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
+            # A short step gains little too.
+            if little and not (thorough and _promised(point) > small):
                 return theta, motions, point.beside(barrier, BARRIER), True
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier
@@ -240,6 +270,17 @@ def _minimise(
                 # No step is short enough: a minimum, or a corner of what bodies can be.
                 return theta, motions, point.beside(barrier, BARRIER), candidate is not None
     return theta, motions, point.beside(barrier, BARRIER), False
+
+
+def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:
+    """A step along which the values of logarithmic unknowns change by what it says at its start.
+
+    Stiffness and inertias make up for each other in proportion to their values: in logarithms
+    the valley of the cost would be curved.
+    """
+    logarithmic = np.array([u.logarithmic for u in problem.unknowns], bool)
+    factor = np.log1p(np.maximum(step, -HALF))
+    return np.where(logarithmic, np.where(step > -HALF, factor, factor + 2 * (step + HALF)), step)
 
 
 def _promised(point: Point) -> float:
@@ -328,13 +369,16 @@ def _warnings(fit: Fit, bounds: Collection[str]):
                     )
 
 
-def predict(model: Model, trial: Trial, motion: np.ndarray) -> np.ndarray:
+def predict(
+    model: Model, trial: Trial, motion: np.ndarray, refinement: float = 1.0
+) -> np.ndarray:
     """Outputs that a model simulates along a trial, shape (n, ny).
 
     Args:
         model: The model.
         trial: The trial.
         motion: What the trial has of its own (Fit.motions).
+        refinement: As the fit's.
     """
     own = own_unknowns(model)
     happened = dict(zip((u.name for u in own), own_values(own, motion), strict=True))
@@ -343,16 +387,19 @@ def predict(model: Model, trial: Trial, motion: np.ndarray) -> np.ndarray:
     p = parameter_vector(model, trial.setup)
     u = trial.inputs_for(compiled.input_names)
     x0 = compiled.initial_state(motion[: len(motion) - len(own)], u[0], p)
-    states = compiled.simulate(trial.time, u, x0, p)
+    states = compiled.simulate(trial.time, u, x0, p, refinement)
     return compiled.outputs(trial.time, u, states, p)
 
 
 def score(
-    model: Model, trials: Sequence[Trial], own: Mapping[str, np.ndarray] | None = None
+    model: Model,
+    trials: Sequence[Trial],
+    own: Mapping[str, np.ndarray] | None = None,
+    thorough: bool = False,
 ) -> Fit:
     """How well a model simulates trials that it was not fitted to.
 
     Only what each trial has of its own is fitted: its initial motion, as no recording states it
     exactly, and what happened in it alone, from the guess `own` (see `fit`).
     """
-    return fit(model, trials, only=(), own=own)
+    return fit(model, trials, only=(), own=own, thorough=thorough)

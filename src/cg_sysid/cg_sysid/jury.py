@@ -33,6 +33,7 @@ AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
 SHORTEST_BLOCK_S = 0.1
+SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
 
 
@@ -102,7 +103,8 @@ class Jury:
         independent = independent_samples(leader.residuals, self.steps)
         reference = _evidence(base, independent)
         ranked = [
-            (self.judge(base, o, reference - _evidence(o, independent)), o) for o in outcomes
+            (self.judge(base, o, reference - _evidence(o, independent), independent), o)
+            for o in outcomes
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
         white = independent > WHITE * _samples(leader)
@@ -113,7 +115,9 @@ class Jury:
             margin = float('inf')
         return Contest(base, tuple(ranked), independent, margin)
 
-    def judge(self, base: Outcome, o: Outcome, gained: float) -> Candidate:
+    def judge(
+        self, base: Outcome, o: Outcome, gained: float, independent: float = float('inf')
+    ) -> Candidate:
         """One outcome against its base, `gained` nats of evidence better."""
         n = self.first_held
         significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
@@ -133,6 +137,13 @@ class Jury:
         elif explained < MATERIAL and not (strained(base) and not strained(o)):
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
+        own = len(o.train.motions[0])
+        if o.train.own and independent < SAYS_MORE * own * len(self.steps):
+            # With a push of its own a short record is matched whatever is wrong, held out or not.
+            reasons.append(
+                f'records of {independent / len(self.steps):.0f} independent samples cannot '
+                f'judge {own} values of each record\'s own'
+            )
         reasons += at_edge(o) + too_small(o)
         return Candidate(
             label=o.label,

@@ -101,6 +101,7 @@ def nelder_mead(
         horizon=max(trial.duration for trial in trials),
         evaluations=cost.problem.evaluations,
         seconds=clock.perf_counter() - began,
+        refinement=1.0,
         converged=bool(found.success),
         warnings=stopped,
     )

@@ -26,13 +26,15 @@ class Problem:
     """Compiled models and constants of one fit.
 
     What a trial has of its own is one vector: its initial motion, then the values of
-    `own_unknowns`. It is believed to lie at `guesses`, give or take `spreads`.
+    `own_unknowns`. It is believed to lie at `guesses`, give or take `spreads`. `refinement`
+    integration steps are taken in place of one.
     """
 
     model: Model
     trials: Sequence[Trial]
     unknowns: tuple[Unknown, ...]
     guesses: Sequence[np.ndarray]
+    refinement: float = 1.0
     spreads: list[np.ndarray] = field(default_factory=list)
     own: tuple[Unknown, ...] = ()
     compiled: list[CompiledModel] = field(default_factory=list)
@@ -214,7 +216,7 @@ def simulate_sensitive(
             s0[:, column] = by_free[:, f]
     normal, y, jacobian = compiled.normal(
         trial.time[:n], u[:n], x0, s0, p, problem.columns[i], trial.outputs[:n], 1 / trial.sigma,
-        keep=keep,
+        keep=keep, refinement=problem.refinement,
     )  # fmt: skip
     return n, normal, y, jacobian
 
@@ -232,14 +234,14 @@ def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]
     factors = []
     for d, e, own_g in point.own:
         damped = d + damping * np.diag(np.diag(d))
-        solved = _solve(damped, np.column_stack([e, own_g]))
+        solved = solve(damped, np.column_stack([e, own_g]))
         h -= e.T @ solved[:, :-1]
         g -= e.T @ solved[:, -1]
         factors.append(solved)
     return h, g, factors
 
 
-def _solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The x of a x = b for a curvature a; directions lost beside far steeper ones stay."""
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     scaled, b = a / np.outer(scale, scale), b / scale[:, None]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cg_sysid.simulation_error import Point, Problem, evaluate, reduced, simulate_sensitive
+from cg_sysid.simulation_error import Point, Problem, evaluate, reduced, simulate_sensitive, solve
 
 SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
 
@@ -56,8 +56,8 @@ def _own_sigmas(
     found = []
     shared = np.where(np.isfinite(covariance), covariance, 0.0)
     for own, cross, _ in point.own:
-        moved = np.linalg.solve(own, cross)
-        spread = np.linalg.inv(own) / rescale + moved @ shared @ moved.T
+        moved = solve(own, cross)
+        spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
         found.append(np.sqrt(np.maximum(np.diag(spread)[-count:], 0.0)))
     return tuple(found)
 
@@ -96,5 +96,5 @@ def _block_scores(
         sums = np.add.reduceat(rows, edges, axis=0)
         m2 = len(motions[i])
         own, cross, _ = point.own[i]
-        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ np.linalg.solve(own, cross))
+        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ solve(own, cross))
     return np.vstack(blocks)

@@ -22,7 +22,7 @@ class ImuMountFlexibility(ImuEffect):
         ),
         Parameter(
             'frequency', 'rad/s', 'natural frequency of the mount', 10.0, 500.0,
-            starts=(40.0, 120.0), scale=5.0, logarithmic=True,
+            starts=(30.0, 70.0, 140.0, 280.0), scale=5.0, logarithmic=True,
         ),
         Parameter(
             'damping_ratio', '1', 'of the mount', 0.005, 2.0,
