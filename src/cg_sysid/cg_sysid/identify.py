@@ -32,7 +32,8 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
-UPHILL = 3.0  # ratio of costs up to which a step uphill is followed by one across the valley
+UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
+BACK = 5  # of these at most
 ACROSS = 1e-3  # damping of that: flat directions stay where they are
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
@@ -242,15 +243,14 @@ def _minimise(
 
     for _ in range(iterations):
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
-        if (
-            thorough
-            and candidate is not None
-            and point.cost < candidate.cost < UPHILL * point.cost
-        ):
+        for _ in range(BACK if thorough else 0):
+            if candidate is None or not point.cost < candidate.cost < UPHILL * point.cost:
+                break
             # A step along a curved valley leaves its floor: back to it, across the valley.
             back = ahead(trial_theta, trial_motions, candidate, max(ACROSS, damping))
-            if back[2] is not None and back[2].cost < point.cost:
-                trial_theta, trial_motions, candidate = back
+            if back[2] is None or back[2].cost > candidate.cost:
+                break
+            trial_theta, trial_motions, candidate = back
         if candidate is not None and candidate.cost < point.cost:
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
