@@ -89,31 +89,37 @@ def what_remains(
     """
     beside = characterise(final, train, held, run)
     alone = characterise(nominal, train, held, run) if causes else None
-    if alone is None or _causes_stand(final, alone, beside, held):
+    if alone is None or _causes_stand(final, alone, beside or alone, (train, held)):
         return beside, True
     return replace(alone, nearest=tuple(sorted(causes))), False
 
 
-def _causes_stand(
-    final: Outcome, alone: Unmodelled, beside: Unmodelled | None, held: Sequence[Trial]
-) -> bool:
-    """Held-out errors with causes, with the term alone, and with both."""
-    both = (beside or alone).fit.model
-    if alone.window is None:
-        fits = [final.held, alone.held or final.held, (beside and beside.held) or final.held]
-    else:
-        length = min(u.window or LONGEST_WINDOW for u in (alone, beside or alone))
-        windows = [window for trial in held for window in cut(both, trial, length)]
-        models = (final.train.model, alone.fit.model, both)
-        fits = [score(_lasting_model(model), windows) for model in models]
-    with_causes, with_term, with_both = (
-        max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits
-    )
-    if with_term > STOOD_IN * with_causes:
+def _causes_stand(final: Outcome, alone: Unmodelled, beside: Unmodelled, sides: Sides) -> bool:
+    """True if causes are of use beside a term, or better than it."""
+    errors = [_above_noise(final, alone, beside, held, side) for held, side in enumerate(sides)]
+    causes, term, both = errors[1]
+    if term > STOOD_IN * causes:
         return True
-    # A little that a cause adds to a term is what the term is too smooth for.
-    added, altogether = np.log(with_term / with_both), np.log(with_causes / with_both)
-    return bool(added > max(OF_USE * altogether, np.log(1 / STOOD_IN)))
+    # A little that a cause adds to a term is what the term is too smooth for; what it adds on
+    # records held out alone is what the term could not learn.
+    added = min(np.log(term / both) for _, term, both in errors)
+    return bool(added > max(OF_USE * np.log(causes / both), np.log(1 / STOOD_IN)))
+
+
+def _above_noise(
+    final: Outcome, alone: Unmodelled, beside: Unmodelled, held: int, trials: Sequence[Trial]
+) -> tuple[float, float, float]:
+    """What causes, a term alone and both leave of training (0) or held-out trials (1)."""
+    if alone.window is None:
+        whole = (final.train, final.held), (alone.fit, alone.held), (beside.fit, beside.held)
+        fits = [pair[held] or pair[0] for pair in whole]
+    else:
+        length = min(u.window or LONGEST_WINDOW for u in (alone, beside))
+        windows = [window for t in trials for window in cut(beside.fit.model, t, length)]
+        models = (final.train.model, alone.fit.model, beside.fit.model)
+        fits = [score(_lasting_model(model), windows) for model in models]
+    causes, term, both = (max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits)
+    return causes, term, both
 
 
 def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[float, list[Term]]:

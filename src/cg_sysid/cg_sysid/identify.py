@@ -35,6 +35,7 @@ DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
 BACK = 5  # of these at most
 ACROSS = 1e-3  # damping of that: flat directions stay where they are
+PROMISED = 10.0  # times that gain, which a full step may still promise where a fit has converged
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
 THOROUGH_ITERATIONS = 24  # of a thorough fit between two sets of weights
@@ -234,7 +235,7 @@ def _minimise(
         if leading:
             frozen |= _unseen(problem, theta, point, weight)
         step, factors = _step(point, damping, frozen)
-        reached = np.clip(theta + (_straight(problem, step) if thorough else step), lower, upper)
+        reached = np.clip(theta + _straight(problem, step), lower, upper)
         step = reached - theta
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
         moved = [m + d for m, d in zip(motions, moves, strict=True)]
@@ -243,7 +244,7 @@ def _minimise(
 
     for _ in range(iterations):
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
-        for _ in range(BACK if thorough else 0):
+        for _ in range(BACK):
             if candidate is None or not point.cost < candidate.cost < UPHILL * point.cost:
                 break
             # A step along a curved valley leaves its floor: back to it, across the valley.
@@ -258,7 +259,7 @@ def _minimise(
             small = SMALL_GAIN if thorough else max(drift * candidate.cost, SMALL_GAIN)
             little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
             # A short step gains little too.
-            if little and not (thorough and _promised(point) > small):
+            if little and _promised(point) < PROMISED * small:
                 return theta, motions, point.beside(barrier, BARRIER), True
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier

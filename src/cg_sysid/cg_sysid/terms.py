@@ -110,6 +110,8 @@ class Sketches:
         found: list[Term] = []
         for effect in self._effects():
             values = np.concatenate([self._variable(effect, piece) for piece in self.pieces])
+            if not len(values):
+                continue  # the error of a sensor that was not recorded
             low, high = float(values.min()), float(values.max())
             if high - low < NEVER:
                 continue

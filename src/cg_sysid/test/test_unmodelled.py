@@ -255,3 +255,15 @@ def test_unlisted_effect_is_described(nominal, case):
     assert np.sqrt(np.mean(wrong**2)) < case.error * size
     assert 'of the library' not in answer.summary
     assert all(name in answer.summary for name in case.listed)
+
+
+def test_described_where_a_sensor_was_not_recorded(nominal):
+    machine = hide(nominal, SoftStop)
+    seen = [
+        replace(r, outputs={c: y for c, y in r.outputs.items() if c != 'imu_rate'})
+        for r in records(machine)
+    ]
+    answer = diagnose(nominal, seen, Options(effects=('ground_slope', 'payload'), workers=1))
+    assert answer.verdict == 'unexplained', answer.summary
+    assert answer.unmodelled is not None
+    assert (answer.unmodelled.where, answer.unmodelled.effect.follows) == ('joint', 'angle:hip')
