@@ -173,6 +173,7 @@ def fit(
     assert point is not None
     values = problem.values(theta)
     covariance, information, own_sigmas = uncertainty(problem, theta, motions, longest, weight)
+    values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
     result = Fit(
         model=fitted,
@@ -317,6 +318,24 @@ def _weight(point: Point) -> float:
     excess = max(1.0, point.sse.sum() / point.count.sum())
     correlation = 1 + 99 * (1 - 1 / excess)
     return 1 / (excess * correlation)
+
+
+def _as_waves_are_written(
+    model: Model, unknowns: Sequence[Unknown], values: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same fit in the one form of a wave that all fits report (Effect.wave)."""
+    values, sign = values.copy(), np.ones(len(values))
+    place = {u.name: i for i, u in enumerate(unknowns)}
+    for effect in model.effects:
+        amplitude, phase = (place.get(f'{effect.label}.{n}') for n in effect.wave or ('', ''))
+        if amplitude is None or phase is None:
+            continue
+        if values[amplitude] < 0:
+            values[amplitude] *= -1
+            values[phase] += np.pi
+            sign[amplitude] = -1
+        values[phase] = np.pi - (np.pi - values[phase]) % (2 * np.pi)
+    return values, covariance * np.outer(sign, sign)
 
 
 def _with_uncertainty(

@@ -15,6 +15,7 @@ class CoggingTorque(Effect):
         'Magnets or teeth pull the joint to certain angles: a torque '
         'amplitude sin(cycles angle + phase) adds to the motor torque.'
     )
+    wave = ('amplitude', 'phase')
     parameters = (
         Parameter(
             'amplitude', 'N m', 'of the ripple', -20.0, 20.0,

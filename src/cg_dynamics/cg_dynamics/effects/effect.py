@@ -115,6 +115,8 @@ class Effect:
         states: Names of extra states.
         largest_step: Longest integration step in s at which the effect is still simulated well.
         extra_inputs: Inputs by name that the effect needs; they come with its parameters in `p`.
+        wave: Names of an amplitude and a phase, where the opposite amplitude half a turn away is
+            the same wave: fits report a positive amplitude and a phase within (-pi, pi].
         contains: Names of simpler effects that this one turns into at a limit of its parameters;
             where the simpler one explains the data as well, it is the one that is meant.
         at: Joint, body or sensor where this instance acts; None where there is only one.
@@ -127,6 +129,7 @@ class Effect:
     states: ClassVar[tuple[str, ...]] = ()
     largest_step: ClassVar[float] = float('inf')
     extra_inputs: ClassVar[tuple[str, ...]] = ()
+    wave: ClassVar[tuple[str, str] | None] = None
     contains: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, mechanism: Mechanism, at: str | None = None):

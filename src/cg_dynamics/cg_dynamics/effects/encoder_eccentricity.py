@@ -15,6 +15,7 @@ class EncoderEccentricity(SensorEffect):
         'The disc of the encoder is off centre, an error that repeats once per revolution: '
         'y = angle + amplitude sin(angle + phase).'
     )
+    wave = ('amplitude', 'phase')
     parameters = (
         Parameter(
             'amplitude', 'rad', 'of the error', -0.5, 0.5,

@@ -17,6 +17,7 @@ class PositionDependentFriction(Effect):
         '-torque (1 + cos(angle - tightest))/2 tanh(rate / transition_rate).'
     )
     contains = ('coulomb_friction',)
+    wave = ('torque', 'tightest')  # the torque is never negative: only the turn counts
     parameters = (
         Parameter(
             'torque', 'N m', 'extra dry friction where it is tightest', 0.0, 50.0,
