@@ -35,7 +35,6 @@ DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
 BACK = 5  # of these at most
 ACROSS = 1e-3  # damping of that: flat directions stay where they are
-PROMISED = 10.0  # times that gain, which a full step may still promise where a fit has converged
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
 THOROUGH_ITERATIONS = 24  # of a thorough fit between two sets of weights
@@ -156,7 +155,7 @@ def fit(
     at_once = THOROUGH_ITERATIONS if thorough else BETWEEN_WEIGHTS
     for _ in range(max(1, iterations // at_once)):
         theta, motions, point, converged = _minimise(
-            problem, theta, motions, longest, weight, at_once, DRIFT, thorough=thorough
+            problem, theta, motions, longest, weight, at_once, 0.0 if thorough else DRIFT
         )
         if point is None:
             raise IdentificationError(
@@ -215,7 +214,6 @@ def _minimise(
     iterations: int,
     drift: float,
     leading: bool = False,
-    thorough: bool = False,
 ) -> tuple[np.ndarray, list[np.ndarray], Point | None, bool]:
     lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
                       for u in problem.unknowns])
@@ -224,18 +222,21 @@ def _minimise(
     if point is None:
         return theta, motions, None, False
     damping = 1e-3
+
+    def frozen(theta, point):
+        """Unknowns that stay where they are, shape (k,)."""
+        _, gradient, _ = reduced(point, 0.0)
+        at_bounds = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+        return at_bounds | _unseen(problem, theta, point, weight) if leading else at_bounds
+
     # The border's weight follows what is still to be gained (a central path): whoever meets the
     # border early creeps along it ever after.
-    barrier = max(BARRIER, CENTRAL * min(_promised(point), point.cost))
+    barrier = max(BARRIER, CENTRAL * min(_promised(point, frozen(theta, point)), point.cost))
     point = point.beside(BARRIER, barrier)
 
     def ahead(theta, motions, point, damping):
         """A damped Gauss-Newton step from a point: where it leads, and the point there."""
-        _, gradient, _ = reduced(point, 0.0)
-        frozen = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
-        if leading:
-            frozen |= _unseen(problem, theta, point, weight)
-        step, factors = _step(point, damping, frozen)
+        step, factors = _step(point, damping, frozen(theta, point))
         reached = np.clip(theta + _straight(problem, step), lower, upper)
         step = reached - theta
         moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
@@ -257,10 +258,10 @@ def _minimise(
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
             damping = max(damping / 10, 1e-9)
-            small = SMALL_GAIN if thorough else max(drift * candidate.cost, SMALL_GAIN)
+            small = max(drift * candidate.cost, SMALL_GAIN)
             little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
             # A short step gains little too.
-            if little and _promised(point) < PROMISED * small:
+            if little and _promised(point, frozen(theta, point)) < small:
                 return theta, motions, point.beside(barrier, BARRIER), True
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier
@@ -285,10 +286,10 @@ def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:
     return np.where(logarithmic, np.where(step > -HALF, factor, factor + 2 * (step + HALF)), step)
 
 
-def _promised(point: Point) -> float:
+def _promised(point: Point, frozen: np.ndarray) -> float:
     """What a full step would lower the cost by, were it quadratic."""
-    h, g, _ = reduced(point, 0.0)
-    return float(g @ np.linalg.lstsq(h, g, rcond=1e-12)[0]) if len(g) else 0.0
+    _, gradient, _ = reduced(point, 0.0)
+    return float(-gradient @ _step(point, 0.0, frozen)[0])
 
 
 def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray, list]:
