@@ -128,7 +128,9 @@ def print_gain(console: Console, facts: Facts) -> None:
                   pad_edge=False, header_style='bold')  # fmt: skip
     for column in table.columns[1:4]:
         column.justify = 'right'
-    for channel, gain in facts['gain'].items():
+    landings = facts.get('landings') or {'gain': {}}
+    after = {f'{channel} after touchdowns': gain for channel, gain in landings['gain'].items()}
+    for channel, gain in (facts['gain'] | after).items():
         table.add_row(
             channel, *(number(gain[k]) for k in ('before', 'after', 'noise_floor')),
             plain_unit(gain['unit']), f'{gain["ratio"]:.3g} x' if gain['ratio'] else '',

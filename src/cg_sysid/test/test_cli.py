@@ -1,11 +1,13 @@
 """The command lines from end to end, and one line for everything that a user can get wrong."""
 
+import io
 import json
 import shutil
 import time
 
 import pytest
 import yaml
+from rich.console import Console
 
 from cg_dynamics.model import Model
 from cg_sysid import cli, diagnose_cli, identify_cli, parallel, report_cli
@@ -265,3 +267,16 @@ def test_a_queue_of_work_can_be_dropped():
     pool.shutdown(wait=True)
     assert time.monotonic() - begun < 10
     assert waiting[-1].cancelled() or waiting[-1].exception() is not None
+
+
+def test_the_gain_table_has_the_landings_too():
+    gain = {'before': 0.0141, 'after': 0.0005, 'noise_floor': 0.0005, 'unit': 'rad', 'ratio': 28.0}
+    phases = {**gain, 'before': 0.0005, 'ratio': 1.0}
+    shown = io.StringIO()
+    cli.print_gain(
+        Console(file=shown, width=120),
+        {'gain': {'imu_angle': phases}, 'landings': {'gain': {'imu_angle': gain}}},
+    )
+    lines = shown.getvalue().splitlines()
+    assert any('imu_angle after touchdowns' in line and '28 x' in line for line in lines)
+    assert any('1 x' in line and 'touchdowns' not in line for line in lines)
