@@ -35,6 +35,7 @@ DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
 BACK = 5  # of these at most
 ACROSS = 1e-3  # damping of that: flat directions stay where they are
+ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
 THOROUGH_ITERATIONS = 24  # of a thorough fit between two sets of weights
@@ -297,7 +298,9 @@ def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray,
     free = ~frozen
     step = np.zeros(len(g))
     if free.any():
-        scale = np.sqrt(np.maximum(np.diag(h)[free], 1e-300))
+        # What is left of a curvature may be less than its rounding: nothing, or below.
+        floor = np.maximum(ROUNDING * np.diag(point.shared_hessian)[free], 1e-300)
+        scale = np.sqrt(np.maximum(np.diag(h)[free], floor))
         scaled = h[np.ix_(free, free)] / np.outer(scale, scale)
         step[free] = -np.linalg.lstsq(scaled, g[free] / scale, rcond=1e-12)[0] / scale
     return step, factors
