@@ -269,12 +269,12 @@ class _Search:
         found = [fitted for fitted in self._fit(tasks, title) if isinstance(fitted, Outcome)]
         return min([o, *found], key=chi2)
 
-    def _among_ties(self, contest: Contest, label: str) -> Contest:
+    def _tie(self, contest: Contest, label: str) -> Contest | None:
         """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
         close = [label, *(c.label for c in contest.close_to(label))]
         ties = [contest.of(name) for name in close]
         if len(close) == 1 or not all(at_noise(pair[1]) for pair in ties if pair):
-            return contest
+            return None
         outcomes = [self._thorough(pair[1]) for pair in ties if pair]
         return self.jury.contest(contest.base, outcomes, thorough=True)
 
@@ -282,11 +282,11 @@ class _Search:
         """The structure with those effects that win over their rivals in thorough fits."""
         for label in sorted(self._added(final)):
             contest = self._without(nominal, final, label)
-            if contest is None or contest.of(label) is None:
+            tie = contest and self._tie(contest, label)
+            if not tie:
                 continue
-            ties = self._among_ties(contest, label)
-            own, winner = ties.of(label), ties.winner()
-            if own and winner and winner[0].evidence > own[0].evidence + ties.margin:
+            own, winner = tie.of(label), tie.winner()
+            if own and winner and winner[0].evidence > own[0].evidence + tie.margin:
                 # Evidence only grows: this comes to an end.
                 return self._ties_settled(nominal, winner[1])
         return final
@@ -473,7 +473,7 @@ class _Search:
                 continue
             if len(self._added(final)) > 1:
                 self._note(contest, label)
-            cause = _cause(final, label, self._among_ties(contest, label))
+            cause = _cause(final, label, self._tie(contest, label) or contest)
             causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
