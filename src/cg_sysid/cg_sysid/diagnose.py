@@ -190,7 +190,6 @@ class _Search:
         self.jury = Jury(train, held)
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
-        self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
         self.rounds: list[Round] = []
 
     def run(self) -> Diagnosis:
@@ -207,7 +206,7 @@ class _Search:
             if self._added(final) in seen:
                 break
             seen.add(self._added(final))
-        return self._conclude(base, self._ties_settled(base, self._less_small_faults(final)))
+        return self._conclude(base, self._less_small_faults(final))
 
     def _added(self, o: Outcome) -> frozenset[str]:
         """Labels of the effects that were put on top of the nominal model, less small faults."""
@@ -247,14 +246,8 @@ class _Search:
     def _thorough(self, o: Outcome) -> Outcome:
         """The last fit of what was found: its values are what people will use.
 
-        Thorough fits stand in contests only among themselves, or they would have the advantage.
+        After all contests, in which one thorough fit would have the advantage.
         """
-        key = frozenset(e.label for e in o.model.effects), frozenset(o.task.bounds)
-        if key not in self.thorough:
-            self.thorough[key] = self._fitted_thoroughly(o)
-        return replace(self.thorough[key], label=o.label)
-
-    def _fitted_thoroughly(self, o: Outcome) -> Outcome:
         task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                     iterations=THOROUGH_ITERATIONS)  # fmt: skip
         tasks = [replace(task, leads=(o.train,))]
@@ -265,31 +258,8 @@ class _Search:
             look = look_at(replace(without, effect=(effect.name, effect.at)), self.train)
             if isinstance(look, Look):
                 tasks += [replace(look.task, leads=(lead,)) for lead in look.task.leads]
-        title = f'thorough fits of {self._title(self._added(o))}'
-        found = [fitted for fitted in self._fit(tasks, title) if isinstance(fitted, Outcome)]
-        return min([o, *found], key=chi2)
-
-    def _tie(self, contest: Contest, label: str) -> Contest | None:
-        """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
-        close = [label, *(c.label for c in contest.close_to(label))]
-        ties = [contest.of(name) for name in close]
-        if len(close) == 1 or not all(at_noise(pair[1]) for pair in ties if pair):
-            return None
-        outcomes = [self._thorough(pair[1]) for pair in ties if pair]
-        return self.jury.contest(contest.base, outcomes, thorough=True)
-
-    def _ties_settled(self, nominal: Outcome, final: Outcome) -> Outcome:
-        """The structure with those effects that win over their rivals in thorough fits."""
-        for label in sorted(self._added(final)):
-            contest = self._without(nominal, final, label)
-            tie = contest and self._tie(contest, label)
-            if not tie:
-                continue
-            own, winner = tie.of(label), tie.winner()
-            if own and winner and winner[0].evidence > own[0].evidence + tie.margin:
-                # Evidence only grows: this comes to an end.
-                return self._ties_settled(nominal, winner[1])
-        return final
+        found = [f for f in self._fit(tasks, 'values of what was found') if isinstance(f, Outcome)]
+        return replace(min([o, *found], key=chi2), label=o.label)
 
     def _with_small_faults(self, o: Outcome) -> Outcome:
         """The same with what every robot has a little of, if that explains anything."""
@@ -473,7 +443,7 @@ class _Search:
                 continue
             if len(self._added(final)) > 1:
                 self._note(contest, label)
-            cause = _cause(final, label, self._tie(contest, label) or contest)
+            cause = _cause(final, label, contest)
             causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
