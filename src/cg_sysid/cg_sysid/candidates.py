@@ -142,7 +142,7 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     label, task = _label(task), _unbound(task)
     longest = max(trial.duration for trial in train)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if eventful(task) or late or longest < 2 * SCREEN_S:
+    if _eventful(task) or late or longest < 2 * SCREEN_S:
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
@@ -225,7 +225,7 @@ def cost_of(task: Task) -> int:
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    if eventful(task):
+    if _eventful(task):
         return _event_fit(task, train)
     model, leads = next(_starting_models(task)), task.leads
     if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
@@ -254,7 +254,7 @@ def _whole(
     )  # fmt: skip
 
 
-def eventful(task: Task) -> bool:
+def _eventful(task: Task) -> bool:
     """Whether the effect is one of which every record has its own."""
     return own_unknowns(task.model) != own_unknowns(next(_starting_models(task)))
 

@@ -38,7 +38,7 @@ ACROSS = 1e-3  # damping of that: flat directions stay where they are
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
-THOROUGH_ITERATIONS = 24  # of a thorough fit between two sets of weights
+BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def fit(
         if found[2] is not None:
             theta, motions = found[0], found[1]
             weight = _weight(found[2]) if reweight else 1.0
-    at_once = THOROUGH_ITERATIONS if thorough else BETWEEN_WEIGHTS
+    at_once = BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS
     for _ in range(max(1, iterations // at_once)):
         theta, motions, point, converged = _minimise(
             problem, theta, motions, longest, weight, at_once, 0.0 if thorough else DRIFT
