@@ -28,6 +28,7 @@ from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknow
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
+BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
@@ -38,7 +39,6 @@ ACROSS = 1e-3  # damping of that: flat directions stay where they are
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 4.0  # integration steps of a thorough fit in place of one
-BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,9 @@ def fit(
         own: Name of a trial -> first guess of what it has of its own beyond its initial motion
             (`own_unknowns`); without one the model's values are the guess.
         bounds: Parameters that stay near the model's value (`unknowns_of`).
-        thorough: Down to the very bottom, at several times the cost: along curved valleys, until
-            a tenth of a squared standard deviation is all that is left to gain, with finer
-            integration. For values that are to be as good as their intervals say.
+        thorough: Down to the very bottom, at several times the cost: until a tenth of a squared
+            standard deviation is all that is left to gain, with finer integration. For values
+            that are to be as good as their intervals say.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
