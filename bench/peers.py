@@ -1,7 +1,8 @@
 """The diagnosis beside its peers: the same hidden recordings, in the same run, as a table.
 
     tools/setup.sh bench                                             # pysindy, mujoco.sysid
-    ./cg exec python bench/peers.py [--seeds 2] [--effects a,b] [--only PEER] [--write FILE]
+    ./cg exec python bench/peers.py [--seeds 2] [--effects a,b] [--only PEER] [--raw FILE]
+        [--write FILE]
 
 The recordings are those of bench/hidden_effects.py: a robot 10 to 20 % off its nominal file, with
 one effect of drawn size hidden in it or none, eight records of 8 s, four to fit and four to judge
@@ -13,13 +14,15 @@ on. Peers, each a module of bench/peers:
     sindy_told      the same, told the true rigid body and friction of the machine
     mujoco_sysid    mujoco.sysid on a MuJoCo model of the robot with all its native parameters
 
-Thresholds of the peers were set on seeds from 201 on, which this bench does not use.
+Every run is one line of `--raw`, and the table is made from all lines there: long runs can be done
+in pieces. Thresholds of the peers were set on seeds from 201 on, which this bench does not use.
 """
 
 import argparse
 import importlib
+import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,13 +107,14 @@ def run(peer: str, effect: str, seed: int, case: Case, records: list, before: fl
     return row
 
 
-def tables(rows: list[Row], peers: list[str]) -> str:
+def tables(rows: list[Row]) -> str:
     """What all rows say: one line per peer, then one per effect."""
     lines = [
         '| peer | first cause right | false alarms | held-out error falls by | down to noise '
         '| s per case |',
         '|---|---:|---:|---:|---:|---:|',
     ]
+    peers = [peer for peer in PEERS if any(r.peer == peer for r in rows)]
     for peer in peers:
         own = [r for r in rows if r.peer == peer]
         hidden = [r for r in own if r.effect != HEALTHY]
@@ -156,7 +160,9 @@ def main():
     parser.add_argument('--first', type=int, default=101, help='first seed')
     parser.add_argument('--effects', help='hide only these')
     parser.add_argument('--only', metavar='PEER', help=f'only these of {", ".join(PEERS)}')
-    parser.add_argument('--write', type=Path, help='file for the tables, kept up to date')
+    parser.add_argument('--raw', type=Path, default=Path('bench/results/peers.jsonl'))
+    parser.add_argument('--write', type=Path, help='file for the tables')
+    parser.add_argument('--table-only', action='store_true', help='run nothing')
     options = parser.parse_args()
     effects = options.effects.split(',') if options.effects else list(EFFECTS)
     peers = options.only.split(',') if options.only else list(PEERS)
@@ -166,32 +172,32 @@ def main():
         if peer != 'diagnosis':
             name_cause(peer)
     healthy = 3 * options.seeds if options.healthy is None else options.healthy
-    rows: list[Row] = []
-    for effect in (HEALTHY, *effects):
+    for effect in () if options.table_only else (HEALTHY, *effects):
         for k in range(healthy if effect == HEALTHY else options.seeds):
             case, records = hidden_case(effect, options.first + k)
             before = baseline(case)
             for peer in peers:
-                rows.append(run(peer, effect, options.first + k, case, records, before))
-            if options.write:
-                write(options, rows, peers)
-    print(tables(rows, peers))
+                row = run(peer, effect, options.first + k, case, records, before)
+                with options.raw.open('a') as raw:
+                    raw.write(json.dumps(asdict(row)) + '\n')
+    lines = [json.loads(line) for line in options.raw.read_text().splitlines()]
+    rows = [Row(**{**line, 'answer': Answer(**line['answer'])}) for line in lines]
+    print(tables(rows))
+    if options.write:
+        write(options.write, rows)
 
 
-def write(options, rows: list[Row], peers: list[str]) -> None:
-    words = [f'--seeds {options.seeds}']
-    words += [f'--{n} {v}' for n in ('healthy', 'effects', 'only')
-              if (v := getattr(options, n)) is not None]
+def write(file: Path, rows: list[Row]) -> None:
     text = (
         '# The diagnosis and its peers\n\n'
-        f'Command: `python bench/peers.py {" ".join(words)}`; {len(rows)} runs. What the peers '
-        'are and get: `bench/peers.py` and the modules of `bench/peers`.\n\n'
+        f'Command: `python bench/peers.py --table-only --write FILE`; {len(rows)} runs. What the '
+        'peers are and get: `bench/peers.py` and the modules of `bench/peers`.\n\n'
         'Right: the first cause that it names is the hidden one, or what physics makes the same. '
         'The error is the RMS simulation error over noise on held-out records, from that of the '
         'nominal model identified anew; median. Time is wall time on this machine; the diagnosis '
         'uses one process per core, mujoco_sysid two threads, the others one.\n\n'
     )
-    options.write.write_text(text + tables(rows, peers))
+    file.write_text(text + tables(rows))
 
 
 if __name__ == '__main__':

@@ -24,7 +24,7 @@ from peers.mujoco_robot import CHANNELS, channels_of, mjcf, put_inertias, soften
 logging.set_verbosity(logging.ERROR)  # our sensors are computed from the state
 
 LOOKED_AT = 6  # candidates that are fitted, of those that were linearised
-AT_NOISE = 1.2  # chi2/N at which no other candidate could do better
+AT_NOISE = 1.2  # chi2/N at which no candidate, or no other, could do better
 ITERATIONS = 12
 FIRST_S = 2.0  # the nominal robot is fitted to so much of each record first
 FD_STEP = 1e-3  # all parameters are in units of a change worth noticing
@@ -198,7 +198,7 @@ def name_cause(case: Case) -> Answer:
     n = problem.samples
     base = n * np.log(problem.squared(found) / n)
     looks = {}
-    for group in natives(case):
+    for group in natives(case) if base > n * np.log(AT_NOISE) else ():
         fall, start = promise(problem, found, result.jac, group, case)
         if fall > looks.get(group[0].effect, (0.0,))[0]:
             looks[group[0].effect] = fall, replace(group[0], start=start)

@@ -39,6 +39,7 @@ FLAGS = (
 MAX_COLUMNS = 64
 REFERENCE_STEP = 0.002
 SMALLEST_STEP = 1e-4
+SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
 
 
@@ -74,6 +75,23 @@ class Normal:
     sse: np.ndarray
     count: np.ndarray
     rows: int
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of a simulation.
+
+    Attributes:
+        time: Their stamps in s, shape (m,).
+        inputs: Inputs from each row to the next, late ones late, shape (m, nu).
+        slope: Their derivative by the delay, as if it went on over the recorded row, (m, nu).
+        recorded: Which of them were recorded, shape (n,).
+    """
+
+    time: np.ndarray
+    inputs: np.ndarray
+    slope: np.ndarray
+    recorded: np.ndarray
 
 
 class CompiledModel:
@@ -175,17 +193,39 @@ class CompiledModel:
         """
         if not self.has_delays:
             return u, np.zeros_like(u)
-        dt = np.diff(time)
-        edges = time - delay
-        row = np.clip(np.searchsorted(time, edges, side='right') - 1, 0, len(time) - 1)
-        held = u[row]
-        area = np.vstack([np.zeros(u.shape[1]), np.cumsum(u[:-1] * dt[:, None], axis=0)])
-        integral = area[row] + held * (edges - time[row])[:, None]
-        mean, slope = u.copy(), np.zeros_like(u)
-        mean[:-1] = np.diff(integral, axis=0) / dt[:, None]
-        slope[:-1] = -np.diff(held, axis=0) / dt[:, None]
-        mean[:, self._never_late], slope[:, self._never_late] = u[:, self._never_late], 0.0
-        return mean, slope
+        slope = np.zeros_like(u)
+        held = u[_row_at(time, time - delay)]
+        slope[:-1] = -np.diff(held, axis=0) / np.diff(time)[:, None]
+        slope[:, self._never_late] = 0.0
+        return self._means(time, time, u, delay), slope
+
+    def _means(
+        self, rows: np.ndarray, time: np.ndarray, u: np.ndarray, delay: float
+    ) -> np.ndarray:
+        """Mean of u(t - delay) from each of `rows` to the next; u is held from `time` on."""
+        edges, row, own = rows - delay, _row_at(time, rows - delay), _row_at(time, rows)
+        area = np.cumsum(u[:-1] * np.diff(time)[:, None], axis=0)
+        area = np.vstack([np.zeros(u.shape[1]), area])
+        integral = area[row] + u[row] * (edges - time[row])[:, None]
+        mean = u[own]
+        mean[:-1] = np.diff(integral, axis=0) / np.diff(rows)[:, None]
+        mean[:, self._never_late] = u[own][:, self._never_late]
+        return mean
+
+    def _late_rows(
+        self, time: np.ndarray, u: np.ndarray, p: np.ndarray, refinement: float
+    ) -> '_Rows':
+        delay = self.delays(p)[0]
+        late, slope = self.delayed_inputs(time, u, delay)
+        if refinement <= 1 or delay <= 0:
+            return _Rows(time, late, slope, np.arange(len(time)))
+        changes = time[1:] + delay
+        changes = changes[changes < time[-1]]
+        row = _row_at(time, changes)
+        gap = np.minimum(changes - time[row], time[row + 1] - changes)
+        rows = np.sort(np.concatenate([time, changes[gap > SAME_INSTANT]]))
+        means, slopes = self._means(rows, time, u, delay), slope[_row_at(time, rows)]
+        return _Rows(rows, means, slopes, np.searchsorted(rows, time))
 
     def simulate(
         self,
@@ -193,7 +233,6 @@ class CompiledModel:
         u: np.ndarray,
         x0: np.ndarray,
         p: np.ndarray,
-        refinement: float = 1.0,
     ) -> np.ndarray:
         """States at the rows, shape (n, nx), from x0 under held inputs.
 
@@ -202,22 +241,12 @@ class CompiledModel:
             u: Inputs, each held until the next row, shape (n, nu), N m.
             x0: State at the first row, shape (nx,).
             p: Parameter vector (assemble.parameter_vector), shape (np,).
-            refinement: Integration steps in place of one of `step_for`.
 
         Raises:
             SimulationError: if the state runs away.
         """
         time, u, x0, p = self._checked(time, u, x0, p)
-        late, _ = self.delayed_inputs(time, u, self.delays(p)[0])
-        late = _array(late)
-        states = np.empty((len(time), self.nx))
-        step = self.step_for(x0, u, p) / refinement
-        rows = self._c.cgm_simulate(len(time), _array(np.diff(time)), step, late, x0, p, states)
-        if rows < len(time):
-            raise SimulationError(
-                f'the state runs away after {time[rows - 1] - time[0]:.3f} s', time[rows - 1]
-            )
-        return states
+        return self._states(self._late_rows(time, u, p, 1.0), x0, p, self.step_for(x0, u, p))
 
     def outputs(
         self, time: np.ndarray, u: np.ndarray, states: np.ndarray, p: np.ndarray
@@ -225,10 +254,37 @@ class CompiledModel:
         """What the sensors report at the rows, shape (n, ny), delays included."""
         time, u, _, p = self._checked(time, u, np.zeros(self.nx), p)
         states = _shaped('states', states, (len(time), self.nx))
-        input_delay, output_delays, _ = self.delays(p)
-        late = _array(self.delayed_inputs(time, u, input_delay)[0])
-        y = np.empty((len(time), self.ny))
-        self._c.cgm_outputs(len(time), time, late, p, states, _array(output_delays), y)
+        return self._outputs(self._late_rows(time, u, p, 1.0), states, p)
+
+    def readings(
+        self,
+        time: np.ndarray,
+        u: np.ndarray,
+        x0: np.ndarray,
+        p: np.ndarray,
+        refinement: float = 1.0,
+    ) -> np.ndarray:
+        """What the sensors report along a simulation, shape (n, ny): the `y` of `normal`."""
+        time, u, x0, p = self._checked(time, u, x0, p)
+        rows = self._late_rows(time, u, p, refinement)
+        states = self._states(rows, x0, p, self.step_for(x0, u, p) / refinement)
+        return self._outputs(rows, states, p)[rows.recorded]
+
+    def _states(self, rows: '_Rows', x0: np.ndarray, p: np.ndarray, step: float) -> np.ndarray:
+        time, n = rows.time, len(rows.time)
+        states = np.empty((n, self.nx))
+        inputs = _array(rows.inputs)
+        done = self._c.cgm_simulate(n, _array(np.diff(time)), step, inputs, x0, p, states)
+        if done < n:
+            raise SimulationError(
+                f'the state runs away after {time[done - 1] - time[0]:.3f} s', time[done - 1]
+            )
+        return states
+
+    def _outputs(self, rows: '_Rows', states: np.ndarray, p: np.ndarray) -> np.ndarray:
+        time, n, delays = rows.time, len(rows.time), _array(self.delays(p)[1])
+        y = np.empty((n, self.ny))
+        self._c.cgm_outputs(n, time, _array(rows.inputs), p, states, delays, y)
         return y
 
     def advance(self, x: np.ndarray, u: np.ndarray, p: np.ndarray, step: float, n: int) -> None:
@@ -265,7 +321,8 @@ class CompiledModel:
             measured: Outputs, NaN where there is no sample, shape (n, ny).
             weight: 1 / standard deviation of each output, shape (ny,).
             keep: Return the simulated outputs and the Jacobian too.
-            refinement: Integration steps in place of one of `step_for`.
+            refinement: Integration steps in place of one of `step_for`. If more than one,
+                inputs that come late change at their instants, else a row has their mean.
         """
         time, u, x0, p = self._checked(time, u, x0, p)
         n, nc = len(time), np.shape(s0)[1]
@@ -274,27 +331,32 @@ class CompiledModel:
         s0 = _shaped('s0', s0, (self.nx, nc))
         measured = _shaped('measured', measured, (n, self.ny))
         weight = _shaped('weight', weight, (self.ny,))
-        input_delay, output_delays, jacobian = self.delays(p)
-        late, slope = self.delayed_inputs(time, u, input_delay)
+        _, output_delays, jacobian = self.delays(p)
+        rows = self._late_rows(time, u, p, refinement)
+        m = len(rows.time)
+        samples = np.full((m, self.ny), np.nan)
+        samples[rows.recorded] = measured
         column = np.ascontiguousarray(column, dtype=np.int32)
         if column.shape != (len(self.free),) or column.max(initial=-1) >= nc:
             raise ValueError(f'column must place {len(self.free)} parameters below {nc}')
         delay_columns = [_delay_column(row, column) for row in jacobian]
         any_late = self.has_delays and (output_delays.any() or max(delay_columns[1:]) >= 0)
-        history = np.empty(n * 2 * self.nx * (1 + nc) if any_late else 1)
+        history = np.empty(m * 2 * self.nx * (1 + nc) if any_late else 1)
         normal = Normal(
             np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0
         )
-        y = np.full((n, self.ny), np.nan) if keep else None
-        j = np.zeros((n, self.ny, nc)) if keep else None
-        rows = self._c.cgm_normal(
-            n, time, self.step_for(x0, u, p) / refinement, _array(late), _array(slope),
-            delay_columns[0], x0, s0, p, nc, column, measured, weight, _array(output_delays),
-            np.array(delay_columns[1:], dtype=np.int32), history,
+        y = np.full((m, self.ny), np.nan) if keep else None
+        j = np.zeros((m, self.ny, nc)) if keep else None
+        done = self._c.cgm_normal(
+            m, rows.time, self.step_for(x0, u, p) / refinement, _array(rows.inputs),
+            _array(rows.slope), delay_columns[0], x0, s0, p, nc, column, samples, weight,
+            _array(output_delays), np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip
-        object.__setattr__(normal, 'rows', rows)
-        return normal, y, j
+        object.__setattr__(normal, 'rows', int(np.searchsorted(rows.recorded, done)))
+        if y is None or j is None:
+            return normal, None, None
+        return normal, y[rows.recorded], j[rows.recorded]
 
     def _checked(self, time, u, x0, p) -> tuple[np.ndarray, ...]:
         # C reads as many numbers as the model has, whatever it is handed.
@@ -353,6 +415,11 @@ def simulate(
 
 def _array(a) -> np.ndarray:
     return np.ascontiguousarray(a, dtype=float)
+
+
+def _row_at(time: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The row that holds at each instant; before the first row it is the first."""
+    return np.clip(np.searchsorted(time, t, side='right') - 1, 0, len(time) - 1)
 
 
 def _shaped(name: str, a, shape: tuple[int, ...]) -> np.ndarray:

@@ -25,8 +25,12 @@ class Hidden:
         viscous: Hip friction per rate in N m s/rad.
         coulomb: Level of dry hip friction in N m, turned smoothly by tanh(rate/transition_rate).
         transition_rate: In rad/s.
-        friction: Any other hip friction, rate in rad/s -> torque in N m that adds to the joint's.
+        at_hip: Any other torque at the hip, (time, angle, rate, torque so far) -> what adds to it.
+        at_stance: A torque between stance leg and ground, (time, angle, rate) -> N m.
+        on_leg: A torque on each leg from outside, its own rate -> N m.
         flexibility: (stiffness, rotor inertia, damping) between motor and hip, or None.
+        gap: Total play of that in rad: within it nothing is transmitted.
+        spring_damping: N s/m of each spring.
         torque_delay: Time in s by which the torque acts late.
         sensor_delay: Time in s by which all sensors are late.
         torque_gain: Delivered over reported torque.
@@ -40,8 +44,12 @@ class Hidden:
     viscous: float = 0.0
     coulomb: float = 0.0
     transition_rate: float = 0.01
-    friction: Callable[[float], float] | None = None
+    at_hip: Callable[[float, float, float, float], float] | None = None
+    at_stance: Callable[[float, float, float], float] | None = None
+    on_leg: Callable[[float], float] | None = None
     flexibility: tuple[float, float, float] | None = None
+    gap: float = 0.0
+    spring_damping: float = 0.0
     torque_delay: float = 0.0
     sensor_delay: float = 0.0
     torque_gain: float = 1.0
@@ -187,23 +195,42 @@ class _Robot:
 
     def apply(self, model, data) -> None:
         """All torques at the hip; called at every stage of every step."""
-        hip, hidden = self.joint['hip'], self.hidden
+        stance, hip, hidden = self.joint['stance'], self.joint['hip'], self.hidden
+        if stance is not None:
+            data.qfrc_passive[stance] += self._from_outside(data, stance, hip)
         if hip is None:
             return
         angle, rate = self.sign * data.qpos[hip], self.sign * data.qvel[hip]
         torque = self.torque
         if self.joint['rotor'] is not None:
             rotor = self.joint['rotor']
-            stiffness, _, damping = hidden.flexibility
-            through = stiffness * (data.qpos[rotor] - angle) + damping * (data.qvel[rotor] - rate)
-            data.qfrc_passive[rotor] += torque - through
-            torque = through
+            torque = self._through(data.qpos[rotor] - angle, data.qvel[rotor] - rate)
+            data.qfrc_passive[rotor] += self.torque - torque
+        if hidden.at_hip is not None:
+            torque += hidden.at_hip(data.time, angle, rate, torque)
         torque -= hidden.viscous * rate
         if hidden.coulomb:
             torque -= hidden.coulomb * math.tanh(rate / hidden.transition_rate)
-        if hidden.friction is not None:
-            torque += hidden.friction(rate)
         data.qfrc_passive[hip] += self.sign * torque
+        if hidden.on_leg is not None:
+            turning = data.qvel[hip] + (0.0 if stance is None else data.qvel[stance])
+            data.qfrc_passive[hip] += hidden.on_leg(turning)
+
+    def _from_outside(self, data, stance, hip) -> float:
+        angle, rate, hidden = data.qpos[stance], data.qvel[stance], self.hidden
+        torque = 0.0 if hidden.at_stance is None else hidden.at_stance(data.time, angle, rate)
+        if hidden.on_leg is not None:
+            torque += hidden.on_leg(rate) + hidden.on_leg(
+                rate + (0.0 if hip is None else data.qvel[hip])
+            )
+        return torque
+
+    def _through(self, twist, twist_rate) -> float:
+        stiffness, _, damping = self.hidden.flexibility
+        free = self.hidden.gap / 2
+        if abs(twist) < free:
+            return 0.0
+        return stiffness * (twist - math.copysign(free, twist)) + damping * twist_rate
 
     def _hip(self) -> tuple[float, float]:
         hip = self.joint['hip']
@@ -255,7 +282,8 @@ def mjcf(values: Mapping[str, float], setup, hidden: Hidden | None = None) -> st
             f'<site name="hook{i}" pos="0 0 {along(spring.body, spring.point)}"/>'
         )
         tendons += (
-            f'<spatial stiffness="{spring.stiffness}" springlength="{spring.free_length}">'
+            f'<spatial stiffness="{spring.stiffness}" springlength="{spring.free_length}" '
+            f'damping="{hidden.spring_damping}">'
             f'<site site="anchor{i}"/><site site="hook{i}"/></spatial>'
         )
     rotor = ''

@@ -152,7 +152,7 @@ def test_effect_that_does_not_apply_to_a_setup_changes_nothing_there(bare, name)
         ('imu_drift', {'rate': 0.02}),
         ('imu_mount_flexibility', {'compliance': 1e-3, 'frequency': 60.0, 'damping_ratio': 0.1}),
         ('position_dependent_friction', {'torque': 1.0, 'tightest': 1.0, 'transition_rate': 0.2}),
-        ('presliding_friction', {'torque': 1.0, 'deflection': 0.03}),
+        ('presliding_friction', {'torque': 1.0, 'deflection': 0.03, 'damping': 2.0}),
         ('torque_saturation', {'limit': 4.0}),
     ],
 )
@@ -333,10 +333,26 @@ def test_effect_equals_that_much_hip_torque(bare, name, values, added, rate):
 
 def test_saturated_torque(bare):
     model, x = bare.with_effect('torque_saturation', limit=5.0), STATES[0]
-    for torque, delivered in ((1.0, 1.0), (5.0, 5 / 2**0.125), (50.0, 5.0), (-50.0, -5.0)):
+    for torque, delivered in ((1.0, 1.0), (5.1, 5.0), (50.0, 5.0), (-50.0, -5.0)):
         np.testing.assert_allclose(
             accelerations(model, x, torque), accelerations(bare, x, delivered), rtol=1e-5
         )
+
+
+def test_bristles_that_bend_are_damped(bare):
+    """LuGre's friction against its textbook form, sigma_0 z + sigma_1 dz/dt."""
+    level, stiffness, damping = 1.2, 60.0, 3.0  # N m, N m/rad, N m s/rad
+    deflection = level / stiffness
+    model = bare.with_effect('presliding_friction', torque=level, deflection=deflection,
+                             damping=damping)  # fmt: skip
+    for rate, z in ((0.5, 0.01), (-0.2, 0.015), (0.05, -0.02)):
+        bending = rate - stiffness * abs(rate) / level * z
+        torque = -stiffness * z - damping * bending
+        x = np.array([0.1, -0.2, 0.3, 0.3 - rate])
+        np.testing.assert_allclose(
+            accelerations(model, [*x, z / deflection], 0.0), accelerations(bare, x, torque),
+            rtol=1e-10,
+        )  # fmt: skip
 
 
 def test_presliding_joint_yields_like_a_spring_and_then_slides(bare):

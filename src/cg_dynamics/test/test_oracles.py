@@ -68,7 +68,7 @@ def test_springs(engine, links, springs, stance):
 
 
 def test_every_hidden_effect(engine, links, springs):
-    Hidden = engine.Hidden
+    Hidden, leg_length = engine.Hidden, links.values['leg_length']
     cases = [
         *(
             (
@@ -81,9 +81,30 @@ def test_every_hidden_effect(engine, links, springs):
         ('coulomb_friction', {'torque': 1.8}, Hidden(coulomb=1.8)),
         (
             'quadratic_friction', {'coefficient': 0.4},
-            Hidden(friction=lambda w: -0.4 * w * abs(w)),
+            Hidden(at_hip=lambda t, angle, w, torque: -0.4 * w * abs(w)),
         ),
         ('ground_slope', {'angle': 0.05}, Hidden(slope=0.05)),
+        (
+            'aerodynamic_drag', {'coefficient': 0.6},
+            Hidden(on_leg=lambda w: -0.6 * w * abs(w)),
+        ),
+        (
+            'ankle_friction', {'coefficient': 0.6},
+            Hidden(at_stance=lambda t, angle, w: -0.6 * w),
+        ),
+        (
+            'tether_force', {'force': 2.0},
+            Hidden(at_stance=lambda t, angle, w: 2.0 * leg_length * np.cos(angle)),
+        ),
+        ('spring_damping', {'coefficient': 0.8}, Hidden(spring_damping=0.8)),
+        (
+            'cogging_torque', {'amplitude': 0.5, 'cycles': 12.0, 'phase': 0.7},
+            Hidden(at_hip=lambda t, angle, w, torque: 0.5 * np.sin(12.0 * angle + 0.7)),
+        ),
+        (
+            'load_dependent_friction', {'coefficient': 0.1},
+            Hidden(at_hip=lambda t, angle, w, torque: -0.1 * abs(torque) * np.tanh(w / 0.01)),
+        ),
         (
             'joint_flexibility', {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.5},
             Hidden(flexibility=(300.0, 0.1, 0.5)),

@@ -13,7 +13,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.events import seek_events
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
-from cg_sysid.imperfections import Bounds
+from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
@@ -339,7 +339,7 @@ def _starting_models(task: Task):
     small = any(effect.label == label for effect in task.model.effects)
     base = task.model.without_effect(label) if small else task.model
     for start in starts_of(name):
-        yield base.with_effect(name, at, **start)
+        yield base.with_effect(name, at, **start | turning(base, name, at))
 
 
 def _label(task: Task) -> str:
@@ -430,8 +430,14 @@ def too_small(o: Outcome) -> list[str]:
 
 
 def at_edge(o: Outcome) -> list[str]:
-    """A parameter at the edge of its range says that the effect is not what is meant."""
+    """A parameter at the edge of its range says that the effect is not what is meant.
+
+    But for a part of an effect that may well be absent: the edge is where it vanishes.
+    """
     found = []
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    optional = {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower
+                } if kind else set()
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
         if not u.name.startswith(f'{o.label}.'):
             continue
@@ -441,6 +447,7 @@ def at_edge(o: Outcome) -> list[str]:
         margin = 1e-3 * (high - low)
         if not u.logarithmic:
             margin = min(margin, 0.1 * u.scale)
-        if min(at - low, high - at) < margin:
+        below = np.inf if u.name in optional else at - low
+        if min(below, high - at) < margin:
             found.append(f'{u.name} = {v:.3g} {u.unit} lies at the edge of its range')
     return found

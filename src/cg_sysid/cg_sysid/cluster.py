@@ -34,6 +34,8 @@ ADDRESS = re.compile(r'(tcp|tls)://(\[[0-9a-fA-F:.%\w]+\]|[^\[\]/:\s]+):\d{1,5}'
 ANSWER_S = 5.0  # a scheduler that is there answers within this
 PATIENCE_S = 60.0  # without any worker in mid-run: a nanny restarts one within seconds
 LARGE = 20_000  # bytes beyond which an argument is sent once, not with each piece of work
+FETCH_S = 30.0  # in which a worker hands over a result, or is asked once more
+FETCHES = 3
 GIVE_UP_S = 0.5  # a worker looks this often whether its work is still wanted
 
 
@@ -121,7 +123,7 @@ class Cluster(Executor):
         if here is None:
             return
         try:
-            here.set_result(there.result())
+            here.set_result(_fetched(there))
         except KilledWorker as error:
             self._fail(here, f'{error.allowed_failures + 1} workers died of the same piece of '
                              f'work, the last one at {error.last_worker.address}')  # fmt: skip
@@ -223,6 +225,19 @@ def _difference(worker: dict[str, str], here: dict[str, str]) -> str:
         if value != here[name]:
             return f'it has {name} {value}, this process {here[name]}; both must be the same'
     return ''
+
+
+def _fetched(there: Any) -> Any:
+    """The result of a future that is done; a worker may be slow to answer once."""
+    from distributed import TimeoutError as Late
+
+    for _ in range(FETCHES - 1):
+        try:
+            return there.result(timeout=FETCH_S)
+        except Late:
+            if there.status == 'error':
+                raise  # the work's own
+    return there.result(timeout=FETCH_S)
 
 
 def _same(value: Any) -> Any:

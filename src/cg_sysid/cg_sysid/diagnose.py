@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.contact import contact_law
-from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
@@ -42,6 +41,7 @@ from cg_sysid.diagnosis import (
     Diagnosis,
     Options,
     Round,
+    contains,
     effect_name,
     gains_of,
     per_output,
@@ -70,6 +70,8 @@ FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
 THOROUGH_ITERATIONS = 72  # of the last fit
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
+OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
+OUTSTANDING_TIMES = 4  # and as many times its even share
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int], None]
 
@@ -77,7 +79,10 @@ Progress = Callable[[str, int, int], None]
 def split(
     trials: Sequence[Trial], chosen: Sequence[str] | None = None
 ) -> tuple[list[Trial], list[Trial]]:
-    """Training and held-out trials: within each set-up, every second one is held out.
+    """Training and held-out trials: within each set-up, every second recording is held out.
+
+    Pieces of one recording share its mishaps and resting places and are poor judges of each
+    other: they are split only where a set-up was recorded once.
 
     Args:
         trials: All of them.
@@ -111,8 +116,13 @@ def split(
             (train if single % 2 == 0 else held).append(group[0])
             single += 1
             continue
-        train += group[0::2]
-        held += group[1::2]
+        recordings = list(dict.fromkeys(trial.recording for trial in group))
+        if len(recordings) > 1:
+            train += [trial for trial in group if trial.recording in recordings[0::2]]
+            held += [trial for trial in group if trial.recording in recordings[1::2]]
+        else:
+            train += group[0::2]
+            held += group[1::2]
     if not held:
         held.append(train.pop())
     return train, held
@@ -190,6 +200,7 @@ class _Search:
         self.jury = Jury(train, held)
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
+        self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
         self.rounds: list[Round] = []
 
     def run(self) -> Diagnosis:
@@ -206,7 +217,7 @@ class _Search:
             if self._added(final) in seen:
                 break
             seen.add(self._added(final))
-        return self._conclude(base, self._less_small_faults(final))
+        return self._conclude(base, self._ties_settled(base, self._less_small_faults(final)))
 
     def _added(self, o: Outcome) -> frozenset[str]:
         """Labels of the effects that were put on top of the nominal model, less small faults."""
@@ -246,8 +257,14 @@ class _Search:
     def _thorough(self, o: Outcome) -> Outcome:
         """The last fit of what was found: its values are what people will use.
 
-        After all contests, in which one thorough fit would have the advantage.
+        Thorough fits stand in contests only among themselves, or they would have the advantage.
         """
+        key = frozenset(e.label for e in o.model.effects), frozenset(o.task.bounds)
+        if key not in self.thorough:
+            self.thorough[key] = self._fitted_thoroughly(o)
+        return replace(self.thorough[key], label=o.label)
+
+    def _fitted_thoroughly(self, o: Outcome) -> Outcome:
         task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                     iterations=THOROUGH_ITERATIONS)  # fmt: skip
         tasks = [replace(task, leads=(o.train,))]
@@ -258,8 +275,31 @@ class _Search:
             look = look_at(replace(without, effect=(effect.name, effect.at)), self.train)
             if isinstance(look, Look):
                 tasks += [replace(look.task, leads=(lead,)) for lead in look.task.leads]
-        found = [f for f in self._fit(tasks, 'values of what was found') if isinstance(f, Outcome)]
-        return replace(min([o, *found], key=chi2), label=o.label)
+        title = f'thorough fits of {self._title(self._added(o))}'
+        found = [fitted for fitted in self._fit(tasks, title) if isinstance(fitted, Outcome)]
+        return min([o, *found], key=chi2)
+
+    def _tie(self, contest: Contest, label: str) -> Contest | None:
+        """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
+        close = [label, *(c.label for c in contest.close_to(label))]
+        ties = [contest.of(name) for name in close]
+        if len(close) == 1 or not all(at_noise(pair[1]) for pair in ties if pair):
+            return None
+        outcomes = [self._thorough(pair[1]) for pair in ties if pair]
+        return self.jury.contest(contest.base, outcomes, thorough=True)
+
+    def _ties_settled(self, nominal: Outcome, final: Outcome) -> Outcome:
+        """The structure with those effects that win over their rivals in thorough fits."""
+        for label in sorted(self._added(final)):
+            contest = self._without(nominal, final, label)
+            tie = contest and self._tie(contest, label)
+            if not tie:
+                continue
+            own, winner = tie.of(label), tie.winner()
+            if own and winner and winner[0].evidence > own[0].evidence + tie.margin:
+                # Evidence only grows: this comes to an end.
+                return self._ties_settled(nominal, winner[1])
+        return final
 
     def _with_small_faults(self, o: Outcome) -> Outcome:
         """The same with what every robot has a little of, if that explains anything."""
@@ -329,7 +369,7 @@ class _Search:
                 return contest.base
             rival, outcome = winner
             better = rival.evidence > own[0].evidence + contest.margin
-            simpler = effect_name(rival.label) in LIBRARY[effect_name(label)].contains
+            simpler = contains(label, rival.label)
             if rival.label != label and (own[0].reason or better or simpler):
                 return outcome
         return None
@@ -443,7 +483,7 @@ class _Search:
                 continue
             if len(self._added(final)) > 1:
                 self._note(contest, label)
-            cause = _cause(final, label, contest)
+            cause = _cause(final, label, self._tie(contest, label) or contest)
             causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
@@ -504,7 +544,7 @@ class _Search:
             train=tuple(self.train),
             held=tuple(self.held),
             remaining=self._remaining(final),
-            findings=(*_small_faults(final), *final.train.warnings),
+            findings=(*_small_faults(final), *_outstanding(final), *final.train.warnings),
             unmodelled=unmodelled,
         )  # fmt: skip
 
@@ -536,6 +576,25 @@ def _small_faults(o: Outcome) -> list[str]:
     return found
 
 
+def _outstanding(o: Outcome) -> list[str]:
+    """Records that hold so much of what is left that every fit is mostly theirs, in words."""
+    if at_noise(o):
+        return []
+    names = [name for side in o.trials for name in side]
+    squared = np.array([
+        np.nansum(mse * count) for fit in (o.train, o.held)
+        for mse, count in zip(fit.mse, fit.count, strict=True)
+    ])  # fmt: skip
+    shares = squared / squared.sum()
+    much = max(OUTSTANDING, OUTSTANDING_TIMES / len(names))
+    return [
+        f'{name} holds {share:.0%} of the error that remains in {len(names)} records: look at '
+        'what is different there before you believe what was found'
+        for name, share in zip(names, shares, strict=True)
+        if share > much
+    ]
+
+
 def _as_in(final: Outcome, cause: Cause) -> Cause:
     """The cause with the values of another fit."""
     return replace(
@@ -555,8 +614,7 @@ def _cause(final: Outcome, label: str, contest: Contest) -> Cause:
         rivals=tuple(
             c.label
             for c in close
-            if effect_name(c.label) != name
-            and name not in LIBRARY[effect_name(c.label)].contains
+            if effect_name(c.label) != name and not contains(c.label, label)
         ),
         places=tuple(c.label for c in close if effect_name(c.label) == name),
         events=events_of(final, label),

@@ -72,7 +72,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     made.add_argument(
         '--held', '--hold-out', metavar='GLOB',
-        help="records to judge on, by name, such as 'spring*_2' [every second of each set-up]",
+        help="records to judge on, by name, such as 'spring*_2' [every second recording of a "
+        'set-up]',
     )  # fmt: skip
     return made
 

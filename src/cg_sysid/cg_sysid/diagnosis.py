@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
@@ -174,6 +175,12 @@ class Options:
 def effect_name(label: str) -> str:
     """Standard name of an effect, its place left out."""
     return label.partition('@')[0]
+
+
+def contains(label: str, other: str) -> bool:
+    """Whether an effect turns into a simpler one, at the same place, at a limit of its own."""
+    (name, _, at), (simpler, _, there) = label.partition('@'), other.partition('@')
+    return simpler in LIBRARY[name].contains and not (at and there and at != there)
 
 
 def gains_of(

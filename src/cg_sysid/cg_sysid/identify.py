@@ -364,7 +364,8 @@ def _warnings(fit: Fit, bounds: Collection[str]):
         if u.name in bounds:
             continue  # the bound is a statement, not a finding
         span = u.upper - u.lower
-        if min(value - u.lower, u.upper - value) <= 1e-6 * span:
+        absent = value == fit.model.declarations[u.name].neutral
+        if min(value - u.lower, u.upper - value) <= 1e-6 * span and not absent:
             yield f'{u.name} = {value:.4g} {u.unit} lies at the edge of its range'
         if not np.isfinite(sigma):
             yield f'{u.name} cannot be identified from these records'
@@ -411,8 +412,7 @@ def predict(
     p = parameter_vector(model, trial.setup)
     u = trial.inputs_for(compiled.input_names)
     x0 = compiled.initial_state(motion[: len(motion) - len(own)], u[0], p)
-    states = compiled.simulate(trial.time, u, x0, p, refinement)
-    return compiled.outputs(trial.time, u, states, p)
+    return compiled.readings(trial.time, u, x0, p, refinement)
 
 
 def score(

@@ -52,6 +52,16 @@ def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bo
     return model, bounds
 
 
+def turning(model: Model, name: str, at: str | None) -> dict[str, float]:
+    """The smoothing of an effect of dry friction: that of the model's own at the same joint."""
+    added = LIBRARY[name](model.mechanism, at)
+    if all(p.name != SMOOTHING[0] for p in added.parameters):
+        return {}
+    at_joint = [f'{e.label}.{SMOOTHING[0]}' for e in model.effects if e.at == added.at]
+    own = [model.values[name] for name in at_joint if name in model.values]
+    return {SMOOTHING[0]: own[0]} if own else {}
+
+
 def imperfect(model: Model, bounds: Bounds) -> set[str]:
     """Labels of the effects of a model that are small faults."""
     names = {name.rpartition('.')[0] for name in bounds if not name.endswith(SMOOTHING[0])}

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_dynamics.effects import LIBRARY
 from cg_sysid.candidates import (
     Outcome,
     at_edge,
@@ -17,13 +16,15 @@ from cg_sysid.candidates import (
     strained,
     too_small,
 )
-from cg_sysid.diagnosis import MARGIN, Candidate, effect_name, per_output
+from cg_sysid.diagnosis import MARGIN, Candidate, contains, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.trial import Trial
 
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
 # so: it is the order of what integrators and interpolation differ by.
 FIDELITY = 1.5e-3
+# The same for thorough fits, whose integration error is two hundred times smaller.
+THOROUGH_FIDELITY = 2e-4
 # A model that leaves more than white noise has something wrong, and small differences say less.
 ROUGH_FIDELITY = 2e-3
 WHITE = 0.9  # share of independent samples from which a residual counts as white noise
@@ -64,7 +65,7 @@ class Contest:
         simpler = [
             pair
             for pair in able
-            if effect_name(pair[0].label) in LIBRARY[effect_name(leader.label)].contains
+            if contains(leader.label, pair[0].label)
             and pair[0].evidence > leader.evidence - self.margin
         ]
         return simpler[0] if simpler else able[0]
@@ -95,8 +96,10 @@ class Jury:
         block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
-    def contest(self, base: Outcome, outcomes: Sequence[Outcome]) -> Contest:
-        """Rank outcomes that extend a base."""
+    def contest(
+        self, base: Outcome, outcomes: Sequence[Outcome], thorough: bool = False
+    ) -> Contest:
+        """Rank outcomes that extend a base; `thorough` says that all their fits are."""
         if not outcomes:
             return Contest(base, (), 2.0, MARGIN)
         leader = min([base, *outcomes], key=chi2)
@@ -108,7 +111,8 @@ class Jury:
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
         white = independent > WHITE * _samples(leader)
-        fidelity = FIDELITY if white else ROUGH_FIDELITY
+        fine = THOROUGH_FIDELITY if thorough else FIDELITY
+        fidelity = fine if white else ROUGH_FIDELITY
         margin = max(MARGIN, fidelity * independent / 2)
         if at_noise(base):
             # Beliefs decide, and those are rough: whatever relieves them is a rival.

@@ -31,6 +31,7 @@ class Trial:
 
     Attributes:
         name: Name of the record.
+        recording: What the record was cut from; its own name if from nothing.
         time: Stamps of the rows in s from the first, shape (n,).
         inputs: Held inputs, shape (n, nu), in the order of `input_names`.
         input_names: Input channels.
@@ -42,6 +43,7 @@ class Trial:
     """
 
     name: str
+    recording: str
     time: np.ndarray
     inputs: np.ndarray
     input_names: tuple[str, ...]
@@ -118,6 +120,7 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     motion, motion_sigma = initial_motion(body, record.setup, time, outputs, sigma)
     return Trial(
         name=record.name,
+        recording=record.source or record.name,
         time=time,
         inputs=np.column_stack([record.inputs[name] for name in names]),
         input_names=names,

@@ -19,7 +19,7 @@ import pytest
 import cg_sysid
 from cg_dynamics.model import Model
 from cg_sysid import cluster, diagnose_cli
-from cg_sysid.cluster import Cluster, ClusterError
+from cg_sysid.cluster import FETCHES, Cluster, ClusterError, _fetched
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.parallel import run_all
@@ -245,6 +245,26 @@ def test_the_command_line_fits_on_the_cluster_and_can_be_interrupted(
 def test_an_error_of_the_work_comes_back(processes):
     with Cluster(processes.address) as workers, pytest.raises(ValueError, match='math domain'):
         run_all(math.sqrt, [(4.0,), (-1.0,)], executor=workers)
+
+
+class _Slow:
+    """A future that is done, on a worker that does not answer at first."""
+
+    def __init__(self, silent, status='finished'):
+        self.silent, self.status = silent, status
+
+    def result(self, timeout):
+        if self.silent:
+            self.silent -= 1
+            raise distributed.TimeoutError
+        return 'here'
+
+
+def test_a_worker_that_does_not_answer_is_asked_again_and_not_for_ever():
+    assert _fetched(_Slow(FETCHES - 1)) == 'here'
+    for silent in (_Slow(FETCHES), _Slow(1, 'error')):
+        with pytest.raises(distributed.TimeoutError):
+            _fetched(silent)
 
 
 def test_work_that_cannot_be_done_ends_with_one_error(tmp_path):

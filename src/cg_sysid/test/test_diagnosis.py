@@ -1,6 +1,12 @@
 """The answer in words."""
 
-from cg_sysid.diagnosis import Cause, Gain, summary_of
+import numpy as np
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Cause, Gain, Options, contains, summary_of
+from cg_sysid.rehearse import rehearse
 
 
 def test_a_ratio_is_printed_without_a_unit_and_a_torque_with_its_own():
@@ -12,3 +18,26 @@ def test_a_ratio_is_printed_without_a_unit_and_a_torque_with_its_own():
     text = summary_of('explained', causes, (gain,), {})
     assert 'imu_scale (scale = 1.02 +- 0.001)' in text
     assert 'torque_bias (torque = 0.8 +- 0.01 N m)' in text
+
+
+def test_a_record_that_holds_most_of_the_error_is_a_finding(model_file):
+    nominal = Model.load(model_file)
+    heavier = nominal.with_effect('payload', 'outer', mass=0.5, distance=0.5)
+    records = [
+        rehearse(f'swing {k}', heavier if k == 3 else nominal, Setup('inner', 'inner_fixed'),
+                 [0.1 * k, 0.5], [lambda t, k=k: 4.0 * np.sin((3 + k) * t)], 2.0, 0.002, k)
+        for k in range(6)
+    ]  # fmt: skip
+    options = Options(effects=('ground_slope',), workers=0)
+    told = [f for f in diagnose(nominal, records, options).findings if 'holds' in f]
+    assert len(told) == 1
+    assert told[0].startswith('swing 3 holds')
+    sound = diagnose(nominal, records[:3] + records[4:], options)
+    assert not any('holds' in f for f in sound.findings)
+
+
+def test_a_simpler_effect_is_contained_at_the_same_place_only():
+    assert contains('stribeck_friction', 'coulomb_friction')
+    assert contains('stribeck_friction@elbow', 'coulomb_friction@elbow')
+    assert not contains('stribeck_friction@elbow', 'coulomb_friction@shoulder')
+    assert not contains('coulomb_friction', 'stribeck_friction')

@@ -78,7 +78,7 @@ HIDDEN = {
     'torque_bias': {'torque_bias': 0.6},
     'ground_slope': {'slope': 0.02},
     'gyro_bias': {'offsets': {'imu_rate': 0.04}},
-    'quadratic_friction': {'friction': lambda rate: -0.3 * rate * abs(rate)},
+    'quadratic_friction': {'at_hip': lambda t, angle, rate, torque: -0.3 * rate * abs(rate)},
 }
 
 

@@ -50,13 +50,23 @@ def test_a_wave_is_reported_in_one_form(model_file, phase):
     # A sin(x + phase) is also -A sin(x + phase + pi), and so is every turn more.
     nominal = Model.load(model_file)
     machine = nominal.with_effect('encoder_eccentricity', amplitude=-0.04, phase=phase)
-    found = fit(
-        nominal.with_effect('encoder_eccentricity', amplitude=-0.02, phase=phase + 0.3),
-        prepare(nominal, [_record(machine, k) for k in range(2)]),
-    ).model.values
-    assert found['encoder_eccentricity.amplitude'] == pytest.approx(0.04, rel=0.02)
+    trials = prepare(nominal, [_record(machine, k) for k in range(2)])
+    found, same = (
+        fit(nominal.with_effect('encoder_eccentricity', amplitude=a, phase=p), trials)
+        for a, p in ((-0.02, phase + 0.3), (0.02, phase + math.pi + 0.3))
+    )
+    values = found.model.values
+    assert values['encoder_eccentricity.amplitude'] == pytest.approx(0.04, rel=0.02)
     expected = math.remainder(phase + math.pi, 2 * math.pi)
-    assert found['encoder_eccentricity.phase'] == pytest.approx(expected, abs=0.02)
+    assert values['encoder_eccentricity.phase'] == pytest.approx(expected, abs=0.02)
+    # The sign of an amplitude is that of its correlations too.
+    correlations = [
+        f.covariance / np.sqrt(np.outer(np.diag(f.covariance), np.diag(f.covariance)))
+        for f in (found, same)
+    ]
+    np.testing.assert_allclose(*correlations, atol=0.02)
+    at = [u.name for u in found.unknowns].index('encoder_eccentricity.amplitude')
+    assert np.abs(np.delete(correlations[0][at], at)).max() > 0.1
 
 
 def test_every_record_has_its_own_push(model_file):

@@ -1,11 +1,16 @@
 """A record made ready for simulation: inputs as a model asks for them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.candidates import candidates_for
+from cg_sysid.diagnose import split
+from cg_sysid.identify import fit
+from cg_sysid.imperfections import turning
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 
@@ -38,3 +43,53 @@ def test_an_effect_of_a_switch_is_tried_where_the_switch_was_recorded(model_file
     without = {name for name, _ in candidates_for(nominal, [Setup()])}
     recorded = {name for name, _ in candidates_for(nominal, [Setup()], None, {'drive_enabled'})}
     assert recorded - without == {'back_emf'}
+
+
+def test_late_torque_and_late_readings_are_told_apart_by_nothing(model_file):
+    """After the first moments they are the same motion: a thorough fit must not tell them apart.
+
+    Coarse rows do, by several units of chi2: the mean of a late torque over a row is not the
+    late torque.
+    """
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('actuator_delay', None, delay=0.0068)
+    rng = np.random.default_rng(3)
+    steps = rng.normal(0.0, 6.0, 200)
+    records = [
+        rehearse(f'steps {k}', machine, Setup('inner', 'inner_fixed'), [0.2, 0.5],
+                 [lambda t, k=k: steps[int(25 * t) + 70 * k]], 3.0, seed=k)
+        for k in range(2)
+    ]  # fmt: skip
+    trials = [
+        replace(t, outputs=np.where(t.time[:, None] < 0.1, np.nan, t.outputs))
+        for t in prepare(nominal, records)
+    ]
+    chi2 = {}
+    for name in ('actuator_delay', 'sensor_delay'):
+        for thorough in (False, True):
+            found = fit(nominal.with_effect(name), trials, only=[f'{name}.delay', 'c1', 'c4'],
+                        thorough=thorough)  # fmt: skip
+            chi2[name, thorough] = (found.mse * found.count).sum()
+    apart = [abs(chi2['actuator_delay', t] - chi2['sensor_delay', t]) for t in (False, True)]
+    assert apart[1] < 1.0, apart
+    assert apart[1] < apart[0], apart
+
+
+def test_dry_friction_that_is_tried_turns_as_fast_as_that_of_the_model(model_file):
+    nominal = Model.load(model_file).with_values({'coulomb_friction.transition_rate': 0.003})
+    assert turning(nominal, 'stribeck_friction', None) == {'transition_rate': 0.003}
+    assert turning(nominal, 'viscous_friction', None) == {}
+    assert turning(nominal.without_effect('coulomb_friction'), 'stribeck_friction', None) == {}
+
+
+def test_whole_recordings_are_held_out_and_pieces_only_of_a_single_one(model_file):
+    nominal = Model.load(model_file)
+    swing = rehearse('swing', nominal, Setup('inner', 'inner_fixed'), [0.2, 0.5], [np.sin], 2.0)
+    once = [replace(p, source='once') for p in swing.segments(0.5)]
+    train, held = split(prepare(nominal, once))
+    assert [len(side) for side in (train, held)] == [2, 2]
+    assert {t.name for t in held} == {once[1].name, once[3].name}
+    thrice = [replace(p, source=s, name=f'{s} {p.name}') for s in 'abc' for p in swing.segments(1)]
+    train, held = split(prepare(nominal, thrice))
+    assert [t.recording for t in train] == ['a', 'a', 'c', 'c']
+    assert [t.recording for t in held] == ['b', 'b']

@@ -8,7 +8,7 @@ from cg_dynamics.parameter import Parameter
 
 
 class AsymmetricFriction(Effect):
-    """-excess s (1 + s) / 2 with s = tanh(rate / transition_rate): only while turning forward.
+    """-excess max(0, tanh(rate / transition_rate)): only while turning forward.
 
     On top of the Coulomb level; a negative excess makes the forward level the lower one.
     """
@@ -16,8 +16,8 @@ class AsymmetricFriction(Effect):
     name = 'asymmetric_friction'
     place = 'joint'
     summary = (
-        'Dry friction is higher one way than the other: -excess s (1 + s)/2 with '
-        's = tanh(rate / transition_rate), on top of the Coulomb level.'
+        'Dry friction is higher one way than the other: '
+        '-excess max(0, tanh(rate / transition_rate)), on top of the Coulomb level.'
     )
     parameters = (
         Parameter(
@@ -30,5 +30,4 @@ class AsymmetricFriction(Effect):
 
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate, where that is positive."""
-        s = ca.tanh(rate / p['transition_rate'])
-        return -p['excess'] * s * (1 + s) / 2, []
+        return -p['excess'] * ca.fmax(0, ca.tanh(rate / p['transition_rate'])), []

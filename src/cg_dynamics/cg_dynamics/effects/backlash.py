@@ -10,7 +10,7 @@ class Backlash(Effect):
     """A rotor of reflected inertia drives the joint through a gap.
 
     With e = a - angle the wind-up, g half of the gap and s(x) = (x + sqrt(x^2 + w^2))/2 a ramp
-    smoothed over w = g/10, the teeth touch by
+    smoothed over w = g/200, the teeth touch by
 
     x = s(e - g) - s(-e - g),  tau_joint = k x + d c (w - rate),  c = dx/de         (GAP)
     """
@@ -21,7 +21,7 @@ class Backlash(Effect):
         'Play in the gear: the rotor turns freely within the gap and pushes the joint only '
         'where teeth touch.'
     )
-    contains = ('rotor_inertia',)
+    contains = ('rotor_inertia', 'joint_flexibility')
     parameters = (
         Parameter(
             'gap', 'rad', 'total play at the joint', 2e-4, 0.3,
@@ -33,11 +33,11 @@ class Backlash(Effect):
         ),
         Parameter(
             'stiffness', 'N m/rad', 'of the touching teeth', 1.0, 1e5,
-            starts=(4000.0,), scale=100.0, free=False, logarithmic=True,
+            starts=(4000.0,), scale=100.0, logarithmic=True,
         ),
         Parameter(
-            'damping', 'N m s/rad', 'of the touching teeth', 0.0, 100.0,
-            starts=(5.0,), scale=0.5, free=False,
+            'damping', 'N m s/rad', 'of the touching teeth', 1e-3, 1000.0,
+            starts=(5.0,), scale=0.5, logarithmic=True,
         ),
     )  # fmt: skip
     states = ('rotor_angle', 'rotor_rate')
@@ -48,7 +48,7 @@ class Backlash(Effect):
         a, w = z
         half = p['gap'] / 2
         wind_up = a - angle
-        width = half / 10
+        width = half / 200
 
         def ramp(x):
             return (x + ca.sqrt(x**2 + width**2)) / 2

@@ -9,13 +9,16 @@ SLIDING_RATE = 0.01  # rad/s; a joint faster than this at the start is sliding a
 
 
 class PreslidingFriction(Effect):
-    """Dahl's model: -torque b with bristles that bend, db/dt = (rate - |rate| b) / deflection."""
+    """Bristles that bend by b before they slide: Dahl's model, with damping LuGre's.
+
+    s = rate - |rate| b,   db/dt = s / deflection,   tau = -torque b - damping s    (LUGRE)
+    """
 
     name = 'presliding_friction'
     place = 'joint'
     summary = (
-        'Dry friction that first yields like a spring (Dahl): -torque b, '
-        'db/dt = (rate - |rate| b) / deflection.'
+        'Dry friction that first yields like a spring (Dahl; LuGre with damping): '
+        '-torque b - damping s, s = rate - |rate| b, db/dt = s / deflection.'
     )
     contains = ('coulomb_friction',)
     parameters = (
@@ -27,14 +30,19 @@ class PreslidingFriction(Effect):
             'deflection', 'rad', 'angle over which friction builds up', 2e-3, 1.0,
             starts=(0.01, 0.05), scale=0.005, logarithmic=True,
         ),
+        Parameter(
+            'damping', 'N m s/rad', 'of the bristles as they bend', 0.0, 50.0,
+            neutral=0.0, starts=(0.0,), scale=0.05,
+        ),
     )  # fmt: skip
     states = ('bristle',)
     largest_step = 0.0005
 
     def joint_torque(self, angle, rate, load, z, p):
-        """Bent bristles pull back."""
+        """(LUGRE)."""
         bent = z[0]
-        return -p['torque'] * bent, [(rate - ca.fabs(rate) * bent) / p['deflection']]
+        bending = rate - ca.fabs(rate) * bent
+        return -p['torque'] * bent - p['damping'] * bending, [bending / p['deflection']]
 
     def initial_states(self, angle, rate, torque, p):
         """Fully bent where the joint moves, relaxed where it rests."""

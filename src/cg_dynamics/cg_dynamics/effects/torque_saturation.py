@@ -1,18 +1,17 @@
 """A motor or drive that cannot deliver what is asked of it."""
 
+import casadi as ca
+
 from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
 
 class TorqueSaturation(Effect):
-    """tau_motor = tau / (1 + (tau/limit)^8)^(1/8): 8 % less at the limit, 1 % at 0.75 of it."""
+    """tau_motor = tau within -limit and limit, as a drive that limits its current."""
 
     name = 'torque_saturation'
     place = 'command'
-    summary = (
-        'The motor delivers no more than its limit, with a smooth corner: '
-        'tau_motor = tau / (1 + (tau/limit)^8)^(1/8).'
-    )
+    summary = 'The motor delivers no more than its limit: tau_motor = tau, cut off at +-limit.'
     parameters = (
         Parameter(
             'limit', 'N m', 'largest torque delivered', 1e-3, 1e3,
@@ -22,4 +21,4 @@ class TorqueSaturation(Effect):
 
     def deliver(self, torque, z, p):
         """Torque with its peaks cut off."""
-        return torque / (1 + (torque / p['limit']) ** 8) ** 0.125, []
+        return ca.fmax(-p['limit'], ca.fmin(p['limit'], torque)), []
