@@ -92,7 +92,7 @@ class Options:
         coarse_iterations: Of one coarse solve.
         fine_iterations: Of the fine solve.
         tolerance: Of constraints and optimality, in the units of the scaled rows.
-        seconds: After which no further solve begins.
+        seconds: After which no further solve begins; a search cut short is undecided.
     """
 
     coarse: int = 8
@@ -101,7 +101,7 @@ class Options:
     coarse_iterations: int = 25
     fine_iterations: int = 100
     tolerance: float = 1e-6
-    seconds: float = 10.0
+    seconds: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -139,10 +139,12 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
     elastic: Program | None = None
     best: Solution | None = None
     misses: list[float] = []
+    cut_short = False
     for number, guess in enumerate(GUESSES):
         if best is not None and number >= options.guesses:
             break
         if time.perf_counter() - began > options.seconds:
+            cut_short = True
             break
         found = strict.solve(strict.guess(guess), options.coarse_iterations, options.tolerance)
         if not found.converged and best is None:
@@ -158,7 +160,10 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
                 found = strict.solve(near, options.coarse_iterations, options.tolerance)
         if found.converged and (best is None or found.cost < best.cost):
             best = found
-    verdict = 'feasible' if best is not None else 'infeasible' if misses else 'undecided'
+    if best is not None:
+        verdict = 'feasible'
+    else:
+        verdict = 'infeasible' if misses and not cut_short else 'undecided'
     miss = 0.0 if best else min(misses, default=math.inf)
     return Screening(verdict, best, miss, time.perf_counter() - began)
 
