@@ -97,7 +97,7 @@ def hide(nominal, effects, size, seed):
             machine = machine.with_effect(name, None, **drawn)
             values[name] = drawn
         else:
-            nominal = nominal.without_effect(name)
+            nominal, values[name] = nominal.without_effect(name), {}
     return nominal, machine, values
 
 
@@ -108,8 +108,14 @@ def case(effects, size, seed, faults, workers=None):
     )
     if faults:
         machine = with_small_faults(machine)
-    began = time.monotonic()
     records = records_of(machine, seed, 0.01 if faults else 0.0)
+    about = {'size': size, 'seed': seed, 'faults': faults}
+    return about | row_of(nominal, records, values, workers)
+
+
+def row_of(nominal, records, hidden, workers=None):
+    """What a diagnosis says of records, beside what was hidden in them: effect -> its values."""
+    began = time.monotonic()
     found = diagnose(nominal, records, Options(workers=workers))
     causes = sorted({effect_name(c.label) for c in found.causes})
     named = sorted({*causes, *(effect_name(r) for c in found.causes for r in c.rivals)})
@@ -119,13 +125,12 @@ def case(effects, size, seed, faults, workers=None):
         for b, a, n in zip(before.mse.T, after.mse.T, before.count.T, strict=True)
     )
     return {
-        'hidden': sorted(effects), 'size': size, 'seed': seed, 'faults': faults,
-        'verdict': found.verdict, 'causes': causes, 'named': named, 'share': share,
-        'before': before.normalised_error, 'after': after.normalised_error,
+        'hidden': sorted(hidden), 'verdict': found.verdict, 'causes': causes, 'named': named,
+        'share': share, 'before': before.normalised_error, 'after': after.normalised_error,
         'inside': [
             bool(abs(off) < 1.96 * sigma)
             for c in found.causes
-            for off, sigma in errors_of(c.parameters, values.get(c.label, {}))
+            for off, sigma in errors_of(c.parameters, hidden.get(effect_name(c.label), {}))
         ],
         'seconds': round(time.monotonic() - began, 1),
     }  # fmt: skip

@@ -16,7 +16,6 @@ have, and `boom_mass`: to an engine a mass is a mass.
 import argparse
 import json
 import sys
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,14 +23,12 @@ from typing import Any
 
 import numpy as np
 import yaml
-from hidden_effects import PROGRAMME, SECONDS, errors_of, summary_of, table_of, verdict_of
+from hidden_effects import PROGRAMME, SECONDS, row_of, summary_of, table_of, verdict_of
 
 from cg_bringup.hidden import draw_values, hidden_effects_file
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options, effect_name
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
 from cg_sysid.record import Record
@@ -240,27 +237,9 @@ def case(effect: str, seed: int, workers: int | None) -> dict[str, Any]:
         )
         for i, name in enumerate(PROGRAMME)
     ]
-    began = time.monotonic()
-    found = diagnose(nominal, records, Options(workers=workers))
-    causes = sorted({effect_name(c.label) for c in found.causes})
-    before, after = found.baseline.held, found.extended.held
-    share = max(
-        float(np.sqrt(max(0.0, np.nansum(b * n) / n.sum() - np.nansum(a * n) / n.sum())))
-        for b, a, n in zip(before.mse.T, after.mse.T, before.count.T, strict=True)
-    )
-    return {
-        'hidden': [] if effect == 'none' else [effect], 'size': 1.0, 'seed': seed,
-        'faults': False, 'verdict': found.verdict, 'causes': causes,
-        'named': sorted({*causes, *(effect_name(r) for c in found.causes for r in c.rivals)}),
-        'share': share, 'before': before.normalised_error, 'after': after.normalised_error,
-        'inside': [
-            bool(abs(off) < 1.96 * sigma)
-            for c in found.causes
-            if effect_name(c.label) == effect
-            for off, sigma in errors_of(c.parameters, values)
-        ],
-        'seconds': round(time.monotonic() - began, 1),
-    }  # fmt: skip
+    hidden = {effect: values} if effect != 'none' else {}
+    about = {'size': 1.0, 'seed': seed, 'faults': False}
+    return about | row_of(nominal, records, hidden, workers)
 
 
 def main():

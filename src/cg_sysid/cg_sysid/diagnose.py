@@ -11,7 +11,7 @@ docs/diagnosis.md says how the decisions are taken and why.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -22,7 +22,6 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
-    ITERATIONS,
     Look,
     Outcome,
     Task,
@@ -66,8 +65,9 @@ REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
-FIRST_ITERATIONS = 24  # of a first fit to whole records; most have converged by then
+RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
+HOPE = 10.0  # times what the last rung gained, from which it may still win
 THOROUGH_ITERATIONS = 72  # of the last fit
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
@@ -426,17 +426,18 @@ class _Search:
         """
         looks = self._looked_at(tasks, f'first look at {what}')
         worth = _worth_more(looks)
-        first = self._fitted([replace(t, iterations=FIRST_ITERATIONS) for t in worth], what)
-        best = min((chi2(o) for o in first.values()), default=0.0)
-        again = [
-            replace(o.task, leads=(o.train,), iterations=ITERATIONS)
-            for o in first.values()
-            if not o.train.converged and chi2(o) < IN_REACH * best
-        ]
-        second = self._fitted(again, f'{what}, in more depth') if again else {}
-        better = {n: o for n, o in second.items() if chi2(o) < chi2(first[n])}
+        found = self._fitted([replace(t, iterations=RUNGS[0]) for t in worth], what)
+        gained: dict[str, float] = {}
+        for iterations in RUNGS[1:]:
+            going = _may_still_win(found, gained)
+            again = self._fitted(
+                [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
+                f'{what}, in more depth',
+            )
+            gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
+            found |= {n: again[n] for n, gain in gained.items() if gain > 0}
         aside = [look.label for look in looks if not any(look.task is task for task in worth)]
-        return list({**first, **better}.values()), aside
+        return list(found.values()), aside
 
     def _looked_at(self, tasks: list[Task], what: str) -> list[Look]:
         looks = self.carry_out(look_at, [(task, self.train) for task in tasks], what)
@@ -556,6 +557,18 @@ def _worth_more(looks: Sequence[Look]) -> list[Task]:
     limit = max(limit, errors[min(FEWEST, len(errors)) - 1]) if errors else limit
     worth = [look.task for look in looks if not look.error > limit]
     return sorted(worth, key=cost_of, reverse=True)
+
+
+def _may_still_win(
+    found: Mapping[str, Outcome], gained: Mapping[str, float]
+) -> list[Outcome]:
+    """Unfinished fits that are near the best, and do not come nearer too slowly."""
+    best = min(map(chi2, found.values()), default=0.0)
+    return [
+        o for label, o in found.items()
+        if not o.train.converged and chi2(o) < IN_REACH * best
+        and (label not in gained or chi2(o) - best <= HOPE * gained[label])
+    ]  # fmt: skip
 
 
 def _shows(o: Outcome, label: str) -> bool:
