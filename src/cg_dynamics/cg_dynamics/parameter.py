@@ -24,8 +24,9 @@ class Parameter:
         logarithmic: True where the ratio of two values means more than their difference.
         swept: True for a frequency or an instant, where the error has many local minima: a first
             look keeps it at each of its starts.
-        each: True for what every record has of its own, as an instant; the value in a model
-            stands for records that nobody has seen.
+        each: What has a value of its own, 'record' (as the instant of a push) or 'recording', all
+            pieces of one together; the value in a model stands for those that nobody has seen.
+            Empty for a property of the machine.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Parameter:
     scale: float = 1.0
     logarithmic: bool = False
     swept: bool = False
-    each: bool = False
+    each: str = ''
 
     @property
     def default(self) -> float:

@@ -15,7 +15,7 @@ from cg_sysid.events import seek_events
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, own_unknowns
+from cg_sysid.unknowns import IdentificationError
 
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
@@ -40,8 +40,8 @@ class Task:
     Attributes:
         model: The base.
         effect: Effect and place.
-        events: What happened in each trial alone, as far as the base knows it: name of the trial
-            -> own values (unknowns.own_unknowns).
+        events: What each trial has of its own, as far as the base knows it: name of the trial ->
+            full name -> value (unknowns.own_unknowns).
         bounds: Small faults that the base may have (imperfections.py).
         leads: Go on from the best of these fits, the most promising first; without any from
             the effect's own starts.
@@ -51,7 +51,7 @@ class Task:
 
     model: Model
     effect: tuple[str, str | None] | None = None
-    events: Mapping[str, np.ndarray] = field(default_factory=dict)
+    events: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
     leads: tuple[Fit, ...] = ()
     iterations: int = ITERATIONS
@@ -85,7 +85,7 @@ class Outcome:
     residuals: tuple[np.ndarray, ...] = field(repr=False)
     belief: float
     unknowns: int
-    events: Mapping[str, np.ndarray]
+    events: Mapping[str, Mapping[str, float]]
     trials: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
 
 
@@ -167,12 +167,13 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     label, task = _label(task), _unbound(task)
     try:
         best = _best_fit(task, train)
-        events = _events_of(best, train)
-        if best.own:
-            known = {t.name: task.events[t.name] for t in held if t.name in task.events}
-            events |= known or seek_events(best.model, held, _surest(best))
-        held_score = score(best.model, held, own=events, thorough=task.thorough)
-        events |= _events_of(held_score, held)
+        known: Mapping[str, Mapping[str, float]] = {
+            t.name: task.events[t.name] for t in held if t.name in task.events
+        }
+        if _eventful(task):
+            known = seek_events(best.model, held, label, known, _surest(best, label))
+        held_score = score(best.model, held, own=known, thorough=task.thorough)
+        events = best.own_by_name(train) | held_score.own_by_name(held)
         model = believing(best.model, task.model, label)
         residuals = tuple(
             (predict(best.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
@@ -190,25 +191,24 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     return Outcome(
         task, label, model, best, held_score, residuals, belief,
         # Small faults cost nothing: every robot has them.
-        len(best.unknowns) - len(task.bounds) + len(best.own) * (len(train) + len(held)), events,
+        len(best.unknowns) - len(task.bounds) + _own_count(best, (*train, *held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),
     )  # fmt: skip
 
 
-def _events_of(found: Fit, trials: Sequence[Trial]) -> dict[str, np.ndarray]:
+def _own_count(found: Fit, trials: Sequence[Trial]) -> int:
+    """Values that these trials have of their own beyond their initial motions."""
+    several = {'record': len(trials), 'recording': len({trial.recording for trial in trials})}
+    return sum(several[u.each] for u in found.own)
+
+
+def _surest(found: Fit, label: str) -> list[np.ndarray]:
+    """An effect's own values in the trials in which something surely happened."""
     count = len(found.own)
-    return {
-        trial.name: motion[len(motion) - count :]
-        for trial, motion in zip(trials, found.motions, strict=True)
-        if count
-    }
-
-
-def _surest(found: Fit) -> list[np.ndarray]:
-    """Own values of the trials in which something surely happened."""
-    own = [motion[-len(found.own) :] for motion in found.motions]
+    place = [k for k, u in enumerate(found.own) if u.name.startswith(f'{label}.')]
+    own = [motion[len(motion) - count :][place] for motion in found.motions]
     sure = [
-        abs(values[0]) / max(sigmas[0], 1e-300)
+        abs(values[0]) / max(sigmas[place[0]], 1e-300)
         for values, sigmas in zip(own, found.own_sigmas, strict=True)
     ]
     order = sorted(range(len(own)), key=lambda i: -sure[i])
@@ -219,7 +219,7 @@ def cost_of(task: Task) -> int:
     """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
     name = _label(task).partition('@')[0]
     kind = LIBRARY[name]
-    events = any(p.each for p in kind.parameters)
+    events = any(p.each == 'record' for p in kind.parameters)
     swept = any(p.swept for p in kind.parameters)
     return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(name))
 
@@ -256,7 +256,9 @@ def _whole(
 
 def _eventful(task: Task) -> bool:
     """Whether the effect is one of which every record has its own."""
-    return own_unknowns(task.model) != own_unknowns(next(_starting_models(task)))
+    if task.effect is None:
+        return False
+    return any(p.each == 'record' for p in LIBRARY[task.effect[0]].parameters)
 
 
 def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
@@ -283,13 +285,13 @@ def _one_minimum(a: Fit, b: Fit, label: str) -> bool:
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     """An effect of which every record has its own size and instant."""
     best = task.leads[0] if task.leads else None
-    settled = best or fit(task.model, train, bounds=task.bounds)
+    settled = best or fit(task.model, train, own=task.events, bounds=task.bounds)
     nothing = settled.normalised_error
     for _ in range(SEEKINGS if best else 1):
         # What was a push is at first taken for other parameters: seek again when it is not.
         at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
         model = next(_starting_models(task))
-        events = seek_events(model.with_values(at), train)
+        events = seek_events(model.with_values(at), train, _label(task), task.events)
         settled = fit(
             model, train, at=at, own=events, bounds=task.bounds, iterations=task.iterations
         )

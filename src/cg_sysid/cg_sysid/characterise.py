@@ -24,7 +24,7 @@ from cg_sysid.response import cut, pieces_of, simulated_signals
 from cg_sysid.shape import GRID, function_of, shape_of
 from cg_sysid.terms import BEYOND, Sketches, Term
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, own_unknowns
+from cg_sysid.unknowns import IdentificationError, without_events
 from cg_sysid.unmodelled import Unmodelled
 
 FINALISTS = 4
@@ -117,7 +117,7 @@ def _above_noise(
         length = min(u.window or LONGEST_WINDOW for u in (alone, beside))
         windows = [window for t in trials for window in cut(beside.fit.model, t, length)]
         models = (final.train.model, alone.fit.model, beside.fit.model)
-        fits = [score(_lasting_model(model), windows) for model in models]
+        fits = [score(without_events(model), windows) for model in models]
     causes, term, both = (max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits)
     return causes, term, both
 
@@ -136,16 +136,8 @@ def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[f
 
 
 def _lasting(base: Outcome) -> Task:
-    """The base without what happened in single records."""
-    return Task(_lasting_model(base.model), bounds=base.task.bounds)
-
-
-def _lasting_model(model: Model) -> Model:
-    """The model without what happened once in single records: that says nothing about a law."""
-    for effect in model.effects:
-        if any(p.each for p in effect.parameters):
-            model = model.without_effect(effect.label)
-    return model
+    """The base without what happened once in single records: that says nothing about a law."""
+    return Task(without_events(base.model), bounds=base.task.bounds)
 
 
 # --- a function that all records share --------------------------------------------------------
@@ -257,7 +249,7 @@ def _extended(model: Model, label: str, believed: Model) -> Model:
 def whole_fit(
     task: Task,
     at: Mapping[str, float],
-    own: Mapping[str, np.ndarray],
+    own: Mapping[str, Mapping[str, float]],
     train: Sequence[Trial],
     held: Sequence[Trial],
 ) -> tuple[Fit, Fit] | str:
@@ -329,29 +321,21 @@ def _period(effect: LearnedEffect, found: Fit) -> tuple[float, float] | None:
 def _vibrating(base: Outcome, term: Term, sides: Sides, run: Run) -> Unmodelled | None:
     """Judged on whole records: a phase of each window's own would explain anything."""
     model = term.added_to(base.model)
-    known = [u.prior for u in own_unknowns(base.model)]
-    nothing = np.zeros(len(own_unknowns(model)) - len(known))
-    events = {
-        trial.name: np.concatenate([base.events.get(trial.name, known), nothing])
-        for side in sides
-        for trial in side
-    }
     tasks = [
         replace(base.task, model=base.model, effect=None, events=base.events, leads=()),
-        replace(base.task, model=model, effect=None, events=events, leads=()),
+        replace(base.task, model=model, effect=None, events=base.events, leads=()),
     ]
     contest = _contest(tasks, [term.label], sides, run)
     if contest is None or contest.ranked[0][0].reason:
         return None
     found = contest.ranked[0][1]
     effect = _learned(found, term.label)
-    names = [u.name for u in found.train.own]
-    places = [names.index(f'{term.label}.{name}') for name in effect.coefficients]
-    waves = {name: own[places] for name, own in found.events.items()}
-    strongest = max(waves.values(), key=lambda own: float(np.hypot(own[0], own[1])))
-    values = {
-        f'{term.label}.{n}': float(v) for n, v in zip(effect.coefficients, strongest, strict=True)
+    names = [f'{term.label}.{name}' for name in effect.coefficients]
+    waves = {
+        trial: np.array([own[name] for name in names]) for trial, own in found.events.items()
     }
+    strongest = max(waves.values(), key=lambda own: float(np.hypot(own[0], own[1])))
+    values = {n: float(v) for n, v in zip(names, strongest, strict=True)}
     time = np.concatenate([trial.time for side in sides for trial in side])
     shown = replace(found.train, model=found.train.model.with_values(values))
     made = _unmodelled(contest, found, base.held, (shown, found.held), time, None)

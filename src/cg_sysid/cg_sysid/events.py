@@ -5,7 +5,7 @@ small event there that would lower the simulation error most, and by how much, i
 question: one sensitivity. Where the answer peaks, a fit of that record alone goes on from.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,81 +14,110 @@ from scipy.signal import find_peaks
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
-from cg_sysid.identify import fit
+from cg_sysid.identify import Fit, fit
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, Unknown, awake, own_unknowns
+from cg_sysid.unknowns import IdentificationError, awake, own_unknowns
 
 GRID_S = 0.2
 FOLLOWED = 3  # peaks from which a fit goes on
 
 
 def seek_events(
-    model: Model, trials: Sequence[Trial], elsewhere: Sequence[np.ndarray] = ()
-) -> dict[str, np.ndarray]:
-    """Trial name -> guess of its own values, shape (len(own_unknowns(model)),).
+    model: Model, trials: Sequence[Trial], label: str,
+    known: Mapping[str, Mapping[str, float]] | None = None,
+    elsewhere: Sequence[np.ndarray] = (),
+) -> dict[str, dict[str, float]]:
+    """Trial name -> full name -> guess of its own value.
 
     Args:
-        model: Has one effect of which every record has a size and an instant; its other values
+        model: Has an effect of which every record has a size and an instant; its other values
             are taken as they are.
         trials: Each is looked at by itself.
-        elsewhere: What happened in other trials; it may have happened in these as well.
+        label: Of the effect.
+        known: What else each trial has of its own, and as far as it is known this.
+        elsewhere: Sizes and instants in other trials; they may be those of these as well.
     """
-    own = own_unknowns(model)
-    if not own:
-        return {}
-    guesses = [_alone(model, trial, own) for trial in trials]
+    names = [u.name for u in own_unknowns(model) if u.name.startswith(f'{label}.')]
+    known = known or {}
+    if trials and all(set(names) <= set(known.get(trial.name, ())) for trial in trials):
+        return {trial.name: dict(known[trial.name]) for trial in trials}
+    seeking = _Seeking(model, names, known)
+    guesses = [seeking.alone(trial) for trial in trials]
     # What happened in one record may have happened at the same time in another.
     surest = sorted(guesses, key=lambda g: g.error / g.quiet)[:FOLLOWED]
-    others = [*elsewhere, *(g.own for g in surest if g.error < g.quiet)]
-    guesses = [_follow(model, t, g, others) for t, g in zip(trials, guesses, strict=True)]
-    return {trial.name: guess.own for trial, guess in zip(trials, guesses, strict=True)}
+    others = [*elsewhere, *(g.event for g in surest if g.error < g.quiet)]
+    guesses = [seeking.follow(t, g, others) for t, g in zip(trials, guesses, strict=True)]
+    return {
+        trial.name: seeking.beside(trial, guess.event)
+        for trial, guess in zip(trials, guesses, strict=True)
+    }
 
 
 @dataclass(frozen=True)
 class _Guess:
-    """Own values of a trial, and its error (chi2/N) with them and with no event."""
+    """Size and instant in a trial, and its error (chi2/N) with the event and without."""
 
-    own: np.ndarray
+    event: np.ndarray
     error: float
     quiet: float
 
 
-def _alone(model: Model, trial: Trial, own: Sequence[Unknown]) -> _Guess:
-    nothing = np.array([0.0, own[1].prior])
-    quiet = fit(model, [trial], only=(), own={trial.name: nothing}, iterations=8)
-    guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
-    motion = quiet.motions[0][: -len(own)]
-    return _follow(model, trial, guess, _small_events(model, trial, motion, own))
+@dataclass(frozen=True)
+class _Seeking:
+    """A search of single trials for size and instant, beside what else is known of each."""
 
+    model: Model
+    names: Sequence[str]
+    known: Mapping[str, Mapping[str, float]]
 
-def _follow(model: Model, trial: Trial, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
-    """The best of a guess and the fits of this record alone from each start."""
-    own = own_unknowns(model)
-    for start in starts:
-        try:
-            found = fit(model, [trial], only=(), iterations=16, own={trial.name: start})
-        except IdentificationError:
-            continue
-        values = found.motions[0][-len(own) :]
-        inside = 0.0 <= values[1] <= trial.duration
-        if inside and found.normalised_error < guess.error:
-            guess = replace(guess, own=values, error=found.normalised_error)
-    return guess
+    def beside(self, trial: Trial, event: np.ndarray) -> dict[str, float]:
+        """All that the trial has of its own, by name."""
+        named = dict(zip(self.names, map(float, event), strict=True))
+        return {**self.known.get(trial.name, {}), **named}
+
+    def alone(self, trial: Trial) -> _Guess:
+        """The best that this trial alone knows."""
+        nothing = np.array([0.0, self.model.values[self.names[1]]])
+        quiet = self._fit(trial, nothing, 8)
+        guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
+        found = quiet.own_by_name([trial])[trial.name]
+        motion = quiet.motions[0][: -len(quiet.own)]
+        others = {name: value for name, value in found.items() if name not in self.names}
+        starts = _small_events(self.model.with_values(others), trial, motion, self.names)
+        return self.follow(trial, guess, starts)
+
+    def follow(self, trial: Trial, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
+        """The best of a guess and the fits of this trial alone from each start."""
+        for start in starts:
+            try:
+                found = self._fit(trial, start, 16)
+            except IdentificationError:
+                continue
+            own = found.own_by_name([trial])[trial.name]
+            event = np.array([own[name] for name in self.names])
+            inside = 0.0 <= event[1] <= trial.duration
+            if inside and found.normalised_error < guess.error:
+                guess = replace(guess, event=event, error=found.normalised_error)
+        return guess
+
+    def _fit(self, trial: Trial, event: np.ndarray, iterations: int) -> Fit:
+        own = {trial.name: self.beside(trial, event)}
+        return fit(self.model, [trial], only=(), own=own, iterations=iterations)
 
 
 def _small_events(
-    model: Model, trial: Trial, motion: np.ndarray, own: Sequence[Unknown]
+    model: Model, trial: Trial, motion: np.ndarray, names: Sequence[str]
 ) -> list[np.ndarray]:
     """Sizes and instants of the events that lower the error most, best first."""
     compiled = compile_model(awake(model), trial.setup)
-    size, instant = (compiled.parameter_names.index(u.name) for u in own)
+    size, instant = (compiled.parameter_names.index(name) for name in names)
     p = parameter_vector(model, trial.setup)
     p[size] = 0.0
     u = trial.inputs_for(compiled.input_names)
     m2 = len(motion)
     x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
     s0 = np.column_stack([by_motion, np.zeros(compiled.nx)])
-    column = np.where(np.array(compiled.free) == own[0].name, m2, -1)
+    column = np.where(np.array(compiled.free) == names[0], m2, -1)
     grid = np.arange(0.0, trial.duration, GRID_S)
     gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
     for k, t in enumerate(grid):

@@ -15,9 +15,9 @@ from cg_dynamics.contact import Ground
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.unpinned import ground_reaction
-from cg_sysid.landings import lasting
 from cg_sysid.phases import SHORTEST_S, longest_run
 from cg_sysid.trial import Trial
+from cg_sysid.unknowns import without_events
 
 INSIDE = 0.97  # share of the cone that counts as held: the force is that of a fitted motion
 
@@ -41,7 +41,7 @@ def held_by_friction(
     Returns:
         Those of which enough is left.
     """
-    model = lasting(model)
+    model = without_events(model)
     found = (
         _held(model, trial, motion, friction, slope)
         for trial, motion in zip(trials, motions, strict=True)

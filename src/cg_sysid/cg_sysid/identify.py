@@ -21,7 +21,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
-from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, own_values, reduced
+from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, moved, own_values, reduced
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
 from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknowns_of
@@ -95,6 +95,18 @@ class Fit:
         factor = [v if u.logarithmic else 1.0 for u, v in pairs]
         return spread * np.array(factor)
 
+    def own_by_name(self, trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
+        """What was found of each trial alone: its name -> full name -> value."""
+        count = len(self.own)
+        return {
+            trial.name: {
+                u.name: float(v)
+                for u, v in zip(self.own, motion[len(motion) - count :], strict=True)
+            }
+            for trial, motion in zip(trials, self.motions, strict=True)
+            if count
+        }
+
     @property
     def normalised_error(self) -> float:
         """Mean squared error over noise variance, all trials and outputs together."""
@@ -110,7 +122,7 @@ def fit(
     horizon: float = np.inf,
     start: Fit | None = None,
     at: Mapping[str, float] | None = None,
-    own: Mapping[str, np.ndarray] | None = None,
+    own: Mapping[str, Mapping[str, float]] | None = None,
     bounds: Mapping[str, float] | None = None,
     thorough: bool = False,
 ) -> Fit:
@@ -125,8 +137,8 @@ def fit(
         horizon: Use only this much of each record, in s: a cheap first look.
         start: Set out from this fit of the same unknowns to a shorter horizon instead.
         at: Set out from these values (full name -> value) instead of those of the file.
-        own: Name of a trial -> first guess of what it has of its own beyond its initial motion
-            (`own_unknowns`); without one the model's values are the guess.
+        own: Name of a trial -> first guesses, by full name, of what it has of its own beyond its
+            initial motion (`own_unknowns`); without one the model's value is the guess.
         bounds: Parameters that stay near the model's value (`unknowns_of`).
         thorough: Down to the very bottom, at several times the cost: until a tenth of a squared
             standard deviation is all that is left to gain, with finer integration. For values
@@ -198,12 +210,13 @@ def fit(
 
 
 def _guesses(
-    model: Model, trials: Sequence[Trial], own: Mapping[str, np.ndarray]
+    model: Model, trials: Sequence[Trial], own: Mapping[str, Mapping[str, float]]
 ) -> list[np.ndarray]:
-    stated = np.array([u.prior for u in own_unknowns(model)])
-    if not len(stated):
-        return [trial.motion for trial in trials]
-    return [np.concatenate([trial.motion, own.get(trial.name, stated)]) for trial in trials]
+    stated = {u.name: u.prior for u in own_unknowns(model)}
+    return [
+        np.array([*trial.motion, *(own.get(trial.name, {}).get(n, v) for n, v in stated.items())])
+        for trial in trials
+    ]
 
 
 def _minimise(
@@ -240,10 +253,9 @@ def _minimise(
         step, factors = _step(point, damping, frozen(theta, point))
         reached = np.clip(theta + _straight(problem, step), lower, upper)
         step = reached - theta
-        moves = [-(solved[:, -1] + solved[:, :-1] @ step) for solved in factors]
-        moved = [m + d for m, d in zip(motions, moves, strict=True)]
-        there = evaluate(problem, reached, moved, horizon, weight)
-        return reached, moved, there.beside(BARRIER, barrier) if there is not None else None
+        there_own = moved(problem, motions, factors, step)
+        there = evaluate(problem, reached, there_own, horizon, weight)
+        return reached, there_own, there.beside(BARRIER, barrier) if there is not None else None
 
     for _ in range(iterations):
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
@@ -418,7 +430,7 @@ def predict(
 def score(
     model: Model,
     trials: Sequence[Trial],
-    own: Mapping[str, np.ndarray] | None = None,
+    own: Mapping[str, Mapping[str, float]] | None = None,
     thorough: bool = False,
 ) -> Fit:
     """How well a model simulates trials that it was not fitted to.

@@ -22,8 +22,9 @@ from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.impulse import measure_impulse
 from cg_sysid.jury import AT_NOISE, EARNED, FIDELITY, MATERIAL, SIGNIFICANT
 from cg_sysid.landed import Impulse, Landings, LawTried
-from cg_sysid.landings import Passage, lasting, ready
+from cg_sysid.landings import Passage, ready
 from cg_sysid.phases import Landing
+from cg_sysid.unknowns import without_events
 
 MOST = 12  # landings that are fitted, and as many that judge
 FEWEST = 2  # of each
@@ -56,7 +57,7 @@ def judge_landings(
         run: Runs a function on tuples of arguments, here or elsewhere.
         effects: Names of the effects to try; by default all.
     """
-    model = lasting(model)
+    model = without_events(model)
     passages = ready(model, landings, sigma)
     train, held = _split(passages)
     if min(len(train), len(held)) < FEWEST:

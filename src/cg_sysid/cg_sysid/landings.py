@@ -66,14 +66,6 @@ class Passage:
     backwards: bool
 
 
-def lasting(model: Model) -> Model:
-    """The model without what happened in single records alone, such as a push."""
-    for effect in model.effects:
-        if any(p.each for p in effect.parameters):
-            model = model.without_effect(effect.label)
-    return model
-
-
 def ready(model: Model, landings: Sequence[Landing], sigma: np.ndarray) -> list[Passage]:
     """The landings that can be simulated: the phase before them is known to near their end.
 

@@ -32,7 +32,8 @@ class Record:
         mechanism: Name of the mechanism (channels.py).
         setup: What was done to the rig.
         note: The recording note as read.
-        source: Path that the record was read from; empty if it was made in memory.
+        source: Path that the record was read from, or the record that it was cut from; empty if it
+            was made in memory.
     """
 
     name: str
@@ -148,8 +149,9 @@ class Record:
         outputs = {c: v[rows] for c, v in self.outputs.items() if not np.isnan(v[rows]).all()}
         inputs = {c: v[rows] for c, v in self.inputs.items()}
         return replace(
-            self, name=name, stamp_ns=self.stamp_ns[rows], inputs=inputs, outputs=outputs
-        )
+            self, name=name, stamp_ns=self.stamp_ns[rows], inputs=inputs, outputs=outputs,
+            source=self.source or self.name,
+        )  # fmt: skip
 
     def segments(self, length_s: float) -> list['Record']:
         """The record cut into consecutive pieces of equal length; a shorter rest is dropped.

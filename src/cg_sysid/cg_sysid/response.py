@@ -23,8 +23,9 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.identify import fit, score
+from cg_sysid.simulation_error import own_values
 from cg_sysid.trial import Trial, initial_motion
-from cg_sysid.unknowns import Unknown
+from cg_sysid.unknowns import Unknown, awake
 
 PIECES_S = (0.5, 0.2, 0.1, 0.05)
 FEWEST = 5  # samples of every output in a piece
@@ -133,9 +134,9 @@ def pieces_of(
     linear: dict[int, _Linear] = {}
     found = []
     for (k, piece), motion in zip(cuts, fitted.motions, strict=True):
-        compiled = compile_model(probe.model, piece.setup)
+        compiled = compile_model(awake(probe.model), piece.setup)
         if id(compiled) not in linear:
-            linear[id(compiled)] = _Linear(probe.model, compiled, names, piece.setup)
+            linear[id(compiled)] = _Linear(probe.model, compiled, names, piece.setup, fitted.own)
         made = linear[id(compiled)].piece(piece, motion, k, k >= len(train))
         if made is not None:
             found.append(made)
@@ -174,8 +175,11 @@ def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
 class _Linear:
     """The symbolic derivatives of one compiled structure."""
 
-    def __init__(self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup):
-        self.model, self.compiled, self.names = model, compiled, list(names)
+    def __init__(
+        self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup,
+        own: Sequence[Unknown],
+    ):
+        self.model, self.compiled, self.names, self.own = model, compiled, list(names), own
         e = compiled.equations
         basis = model.mechanism.kinematics(setup).basis
         by_force = ca.solve(e.mass_matrix, basis.T)
@@ -188,9 +192,11 @@ class _Linear:
         self.m = e.coordinates
 
     def piece(self, piece: Trial, motion: np.ndarray, record: int, held: bool) -> Piece | None:
-        """One piece from its initial motion; None where sensitivities run away."""
+        """One piece from what it has of its own; None where sensitivities run away."""
         compiled, m, names = self.compiled, self.m, self.names
-        p = parameter_vector(self.model, piece.setup)
+        found = zip((u.name for u in self.own), own_values(self.own, motion), strict=True)
+        p = parameter_vector(self.model.with_values(dict(found)), piece.setup)
+        motion = motion[: 2 * m]
         u = piece.inputs_for(compiled.input_names)
         n, nx = len(piece.time), compiled.nx
         x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)

@@ -2,10 +2,11 @@
 
 One evaluation simulates every trial with exact sensitivities and adds up the normal equations.
 Each trial's own unknowns, its initial motion, couple to the shared parameters only, so that a
-Schur complement leaves a system as small as the number of parameters, however many records.
+Schur complement leaves a system as small as the number of parameters, however many records. Where
+trials are pieces of one recording and share something of its own, they are eliminated together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -26,8 +27,8 @@ class Problem:
     """Compiled models and constants of one fit.
 
     What a trial has of its own is one vector: its initial motion, then the values of
-    `own_unknowns`. It is believed to lie at `guesses`, give or take `spreads`. `refinement`
-    integration steps are taken in place of one.
+    `own_unknowns`; it lies at `places` of the vector of its block. It is believed to lie at
+    `guesses`, give or take `spreads`. `refinement` integration steps are taken in place of one.
     """
 
     model: Model
@@ -37,6 +38,7 @@ class Problem:
     refinement: float = 1.0
     spreads: list[np.ndarray] = field(default_factory=list)
     own: tuple[Unknown, ...] = ()
+    blocks: tuple['Block', ...] = ()
     compiled: list[CompiledModel] = field(default_factory=list)
     vectors: list[np.ndarray] = field(default_factory=list)
     places: list[np.ndarray] = field(default_factory=list)
@@ -69,6 +71,12 @@ class Problem:
                 np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)
             )
         self.consistency = _consistency(self.model, names)
+        self.blocks = _blocks(self.trials, self.own)
+        shared = np.array([u.each == 'recording' for u in self.own], bool)
+        for block in self.blocks:
+            for i in block.trials[1:]:
+                # What a recording has of its own is believed once.
+                self.spreads[i][len(self.spreads[i]) - len(shared) :][shared] = np.inf
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Coordinates -> values."""
@@ -79,6 +87,42 @@ class Problem:
         return np.array(
             [v if u.logarithmic else 1.0 for u, v in zip(self.unknowns, values, strict=True)]
         )
+
+
+@dataclass(frozen=True)
+class Block:
+    """Trials whose own unknowns are eliminated together.
+
+    Attributes:
+        trials: Their numbers.
+        places: Of each, where its own vector lies in the block's.
+        size: Length of the block's.
+    """
+
+    trials: tuple[int, ...]
+    places: tuple[np.ndarray, ...]
+    size: int
+
+
+def _blocks(trials: Sequence[Trial], own: Sequence[Unknown]) -> tuple[Block, ...]:
+    """Each trial alone or, where something belongs to a recording, with the others of that."""
+    shared = np.array([u.each == 'recording' for u in own], bool)
+    together: dict[str, list[int]] = {}
+    for i, trial in enumerate(trials):
+        together.setdefault(trial.recording if shared.any() else str(i), []).append(i)
+    blocks = []
+    for members in together.values():
+        places, size = [], int(shared.sum())
+        for i in members:
+            m2 = len(trials[i].motion)
+            alone = m2 + int((~shared).sum())
+            place = np.empty(m2 + len(own), int)
+            place[np.concatenate([np.ones(m2, bool), ~shared])] = size + np.arange(alone)
+            place[np.concatenate([np.zeros(m2, bool), shared])] = np.arange(shared.sum())
+            places.append(place)
+            size += alone
+        blocks.append(Block(tuple(members), tuple(places), size))
+    return tuple(blocks)
 
 
 def compile_free(model: Model, names: Sequence[str]) -> tuple[str, ...] | None:
@@ -120,12 +164,15 @@ class Border:
 
 @dataclass(frozen=True)
 class Point:
-    """Cost and normal equations at one point, the border of consistency with weight BARRIER."""
+    """Cost and normal equations at one point, the border of consistency with weight BARRIER.
+
+    Own are curvature, coupling to what is shared, and gradient of each block of the problem.
+    """
 
     cost: float
     shared_hessian: np.ndarray
     shared_gradient: np.ndarray
-    own: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # D, E, g of each trial
+    own: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # D, E, g
     sse: np.ndarray
     count: np.ndarray
     data_cost: float
@@ -150,7 +197,8 @@ def evaluate(
     values = problem.values(theta)
     chain = problem.chain(values)
     shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
-    own, cost = [], 0.0
+    own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    cost = 0.0
     border = Border(0.0, shared_g, shared_h)
     ny = len(problem.trials[0].sigma)
     sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
@@ -175,7 +223,7 @@ def evaluate(
         away = (motions[i] - problem.guesses[i]) / problem.spreads[i]
         own_h = h[:m2, :m2] + np.diag(1 / problem.spreads[i] ** 2)
         own_g = g[:m2] + away / problem.spreads[i]
-        own.append((own_h, h[:m2, m2:], own_g))
+        own[i] = own_h, h[:m2, m2:], own_g
         shared_h += h[m2:, m2:]
         shared_g += g[m2:]
         cost += weight * normal.sse.sum() + away @ away
@@ -186,8 +234,21 @@ def evaluate(
             cost += away**2
             shared_g[j] += away / u.tolerance
             shared_h[j, j] += 1 / u.tolerance**2
-    point = Point(cost, shared_h, shared_g, own, sse, count, data_cost, border)
+    blocks = [_together(block, own, k) for block in problem.blocks]
+    point = Point(cost, shared_h, shared_g, blocks, sse, count, data_cost, border)
     return point.beside(0.0, BARRIER)
+
+
+def _together(
+    block: Block, own: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]], k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Curvature, coupling to the k shared unknowns and gradient of a block."""
+    d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
+    for i, place in zip(block.trials, block.places, strict=True):
+        d[np.ix_(place, place)] += own[i][0]
+        e[place] += own[i][1]
+        g[place] += own[i][2]
+    return d, e, g
 
 
 def simulate_sensitive(
@@ -219,6 +280,21 @@ def simulate_sensitive(
         keep=keep, refinement=problem.refinement,
     )  # fmt: skip
     return n, normal, y, jacobian
+
+
+def moved(
+    problem: Problem,
+    motions: Sequence[np.ndarray],
+    factors: Sequence[np.ndarray],
+    step: np.ndarray,
+) -> list[np.ndarray]:
+    """What each trial has of its own after a step of the shared unknowns (`reduced`)."""
+    found = list(motions)
+    for block, solved in zip(problem.blocks, factors, strict=True):
+        move = -(solved[:, -1] + solved[:, :-1] @ step)
+        for i, place in zip(block.trials, block.places, strict=True):
+            found[i] = motions[i] + move[place]
+    return found
 
 
 def own_values(own: Sequence[Unknown], motion: np.ndarray) -> np.ndarray:

@@ -52,13 +52,15 @@ def _own_sigmas(
     """Standard deviation of each trial's own values, what is shared being uncertain too."""
     count = len(problem.own)
     if not count:
-        return tuple(np.zeros(0) for _ in point.own)
-    found = []
+        return tuple(np.zeros(0) for _ in problem.trials)
+    found = [np.zeros(count) for _ in problem.trials]
     shared = np.where(np.isfinite(covariance), covariance, 0.0)
-    for own, cross, _ in point.own:
+    for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
         moved = solve(own, cross)
         spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
-        found.append(np.sqrt(np.maximum(np.diag(spread)[-count:], 0.0)))
+        sigmas = np.sqrt(np.maximum(np.diag(spread), 0.0))
+        for i, place in zip(block.trials, block.places, strict=True):
+            found[i] = sigmas[place][-count:]
     return tuple(found)
 
 
@@ -86,6 +88,11 @@ def _block_scores(
     values = problem.values(theta)
     chain = problem.chain(values)
     blocks = []
+    # What moves of each trial's own with what is shared, shape (own, k).
+    follows: dict[int, np.ndarray] = {}
+    for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
+        solved = solve(own, cross)
+        follows |= {i: solved[p] for i, p in zip(block.trials, block.places, strict=True)}
     for i, trial in enumerate(problem.trials):
         n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
         assert y is not None
@@ -95,6 +102,5 @@ def _block_scores(
         edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))
         sums = np.add.reduceat(rows, edges, axis=0)
         m2 = len(motions[i])
-        own, cross, _ = point.own[i]
-        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ solve(own, cross))
+        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ follows[i])
     return np.vstack(blocks)

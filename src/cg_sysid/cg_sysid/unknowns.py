@@ -30,6 +30,7 @@ class Unknown:
         upper: Largest allowed value.
         logarithmic: Moved as log(value).
         scale: Typical change, for damping.
+        each: What has a value of its own, 'record' or 'recording'; empty for a shared one.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Unknown:
     upper: float
     logarithmic: bool
     scale: float
+    each: str = ''
 
     def to_coordinate(self, value: float) -> float:
         """Value -> coordinate."""
@@ -111,11 +113,11 @@ def _bounded(name: str, parameter: Parameter, value: float, bound: float) -> Unk
 
 
 def own_unknowns(model: Model) -> tuple[Unknown, ...]:
-    """The parameters of which every record has a value of its own, such as a push's instant."""
+    """The parameters of which every record or recording has a value of its own."""
     return tuple(
         Unknown(
             name, p.unit, model.values[name], OWN_SPREAD * p.scale, p.lower, p.upper, False,
-            p.scale,
+            p.scale, p.each,
         )
         for name, p in model.declarations.items()
         if p.each
@@ -128,3 +130,11 @@ def awake(model: Model) -> Model:
     At its neutral value an effect takes no part in the equations at all.
     """
     return model.with_values({u.name: u.scale for u in own_unknowns(model)})
+
+
+def without_events(model: Model) -> Model:
+    """The model without what happened in single records alone, such as a push."""
+    for effect in model.effects:
+        if any(p.each == 'record' for p in effect.parameters):
+            model = model.without_effect(effect.label)
+    return model

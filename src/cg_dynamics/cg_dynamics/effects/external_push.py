@@ -26,11 +26,11 @@ class ExternalPush(StanceEffect):
     parameters = (
         Parameter(
             'impulse', 'N s', 'integral of the force, positive forward', -200.0, 200.0,
-            neutral=0.0, starts=(0.5,), scale=0.1, each=True,
+            neutral=0.0, starts=(0.5,), scale=0.1, each='record',
         ),
         Parameter(
             'instant', 's', 'time of the greatest force from the start of the record', 0.0, 600.0,
-            starts=(0.5,), scale=0.005, each=True,
+            starts=(0.5,), scale=0.005, each='record',
         ),
         Parameter(
             'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,

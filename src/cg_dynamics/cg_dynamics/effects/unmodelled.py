@@ -204,7 +204,7 @@ def _parameters(unit: str, variable: str, kind: str) -> tuple[Parameter, ...]:
     found = tuple(
         Parameter(
             name, unit, 'coefficient of the function', -LARGEST, LARGEST,
-            neutral=0.0, scale=0.1, each=kind == 'vibrating',
+            neutral=0.0, scale=0.1, each='record' if kind == 'vibrating' else '',
         )
         for name in _coefficients(kind)
     )  # fmt: skip
