@@ -15,7 +15,7 @@ from cg_sysid.events import seek_events
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError
+from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
@@ -47,6 +47,8 @@ class Task:
             the effect's own starts.
         iterations: Limit for whole records.
         thorough: Fit whole records down to the very bottom (identify.fit).
+        base: Fit of the base. With an effect more it can only be better; where a fit from the
+            file's numbers is not, it goes on from there.
     """
 
     model: Model
@@ -56,6 +58,7 @@ class Task:
     leads: tuple[Fit, ...] = ()
     iterations: int = ITERATIONS
     thorough: bool = False
+    base: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -227,6 +230,29 @@ def cost_of(task: Task) -> int:
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     if _eventful(task):
         return _event_fit(task, train)
+    best = _own_fit(task, train)
+    if task.base is None or best.normalised_error <= task.base.normalised_error:
+        return best
+    model = next(_starting_models(task))
+    again = _whole(task, model, train, _beyond(task.base, model, task), task.iterations)
+    return min(best, again, key=lambda found: found.normalised_error)
+
+
+def _beyond(base: Fit, model: Model, task: Task) -> Fit:
+    """The base's fit as a start for the model with an effect more, that at its own start."""
+    known = {u.name: v for u, v in zip(base.unknowns, base.values, strict=True)}
+    unknowns = unknowns_of(model, bounds=task.bounds)
+    own = own_unknowns(model)
+    motions = []
+    for motion in base.motions:
+        first = len(motion) - len(base.own)
+        known_own = {u.name: v for u, v in zip(base.own, motion[first:], strict=True)}
+        motions.append(np.array([*motion[:first], *(known_own.get(u.name, u.prior) for u in own)]))
+    values = np.array([known.get(u.name, u.prior) for u in unknowns])
+    return replace(base, unknowns=unknowns, values=values, own=own, motions=tuple(motions))
+
+
+def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
     model, leads = next(_starting_models(task)), task.leads
     if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
         leads = _first_seconds(task, train)

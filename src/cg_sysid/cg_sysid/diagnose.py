@@ -410,7 +410,10 @@ class _Search:
                 base.model, self._setups(), self.options.effects, recorded,
                 imperfect(base.model, bounds),
             )  # fmt: skip
-            tasks = [Task(base.model, effect, base.events, bounds) for effect in effects]
+            tasks = [
+                Task(base.model, effect, base.events, bounds, base=base.train)
+                for effect in effects
+            ]
             # The longest first, or the last of them would be waited for.
             tasks.sort(key=cost_of, reverse=True)
             outcomes, aside = self._fit_all(tasks, f'effects on top of {self._title(added)}')

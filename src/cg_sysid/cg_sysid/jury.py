@@ -141,13 +141,12 @@ class Jury:
         elif explained < MATERIAL and not (strained(base) and not strained(o)):
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
-        own = len(o.train.motions[0])
-        eventful = any(u.each == 'record' for u in o.train.own)
-        if eventful and independent < SAYS_MORE * own * len(self.steps):
+        own = _own_values(o) / len(self.steps)
+        if o.train.own and independent < SAYS_MORE * own * len(self.steps):
             # With a push of its own a short record is matched whatever is wrong, held out or not.
             reasons.append(
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
-                f'judge {own} values of each record\'s own'
+                f'judge {own:.0f} values of each record\'s own'
             )
         reasons += at_edge(o) + too_small(o)
         return Candidate(
@@ -162,6 +161,13 @@ class Jury:
             parameters=own_parameters(o),
             reason='; '.join(reasons),
         )
+
+
+def _own_values(o: Outcome) -> int:
+    """All that the records have of their own: initial motions, and what the effects add."""
+    motions = sum(len(motion) - len(o.train.own) for motion in (*o.train.motions, *o.held.motions))
+    shared = len(o.train.unknowns) - len(o.task.bounds)
+    return motions + o.unknowns - shared
 
 
 def settled(o: Outcome) -> bool:
