@@ -49,6 +49,7 @@ class Task:
         thorough: Fit whole records down to the very bottom (identify.fit).
         base: Fit of the base. With an effect more it can only be better; where a fit from the
             file's numbers is not, it goes on from there.
+        first: Fit of the base to the first seconds, for looks in the same way.
     """
 
     model: Model
@@ -59,6 +60,7 @@ class Task:
     iterations: int = ITERATIONS
     thorough: bool = False
     base: Fit | None = None
+    first: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,11 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
+        if task.first is not None and leads[0].normalised_error > task.first.normalised_error:
+            model = next(_starting_models(task))
+            beyond = _look(task, model, train, start=_beyond(task.first, model, task))
+            leads = tuple(sorted([beyond, *leads], key=lambda lead: lead.normalised_error))
+            leads = leads[:FOLLOWED]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
     return Look(label, replace(task, leads=leads), leads[0].normalised_error)
@@ -330,6 +337,28 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     return replace(best, converged=found)
 
 
+def _look(
+    task: Task,
+    model: Model,
+    train: Sequence[Trial],
+    only: Sequence[str] | None = None,
+    start: Fit | None = None,
+) -> Fit:
+    """A fit to the first seconds of each record."""
+    return fit(
+        model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS, start=start,
+        own=task.events, bounds=task.bounds,
+    )  # fmt: skip
+
+
+def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
+    """Fit of a task's base to the first seconds, from its fit to whole records; None without."""
+    try:
+        return _look(task, task.model, train, start=task.base)
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return None
+
+
 def _swept(model: Model) -> list[str]:
     # Of the effect that is being tried: those before it stay about where they were found.
     own = model.effects[-1]
@@ -345,10 +374,7 @@ def _looks(
         moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
         only = [name for name in moved if name not in kept] if kept else None
         try:
-            look = fit(
-                model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS,
-                own=task.events, bounds=task.bounds,
-            )  # fmt: skip
+            look = _look(task, model, train, only)
             found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
             looks.append((look, model.with_values(found)))
         except IdentificationError as error:

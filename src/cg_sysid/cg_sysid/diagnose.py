@@ -29,6 +29,7 @@ from cg_sysid.candidates import (
     chi2,
     cost_of,
     events_of,
+    first_seconds,
     look_at,
     parameters_of,
     strained,
@@ -410,10 +411,9 @@ class _Search:
                 base.model, self._setups(), self.options.effects, recorded,
                 imperfect(base.model, bounds),
             )  # fmt: skip
-            tasks = [
-                Task(base.model, effect, base.events, bounds, base=base.train)
-                for effect in effects
-            ]
+            alone = Task(base.model, None, base.events, bounds, base=base.train)
+            alone = replace(alone, first=first_seconds(alone, self.train))
+            tasks = [replace(alone, effect=effect) for effect in effects]
             # The longest first, or the last of them would be waited for.
             tasks.sort(key=cost_of, reverse=True)
             outcomes, aside = self._fit_all(tasks, f'effects on top of {self._title(added)}')

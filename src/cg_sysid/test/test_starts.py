@@ -89,7 +89,7 @@ def test_every_record_has_its_own_push(model_file):
     # Noise alone gives 1, within a few percent at a thousand rows.
     assert outcome.held.normalised_error < 1.2
     for k in range(4):
-        impulse, instant = outcome.events[f'record_{k}']
+        impulse, instant = outcome.events[f'record_{k}'].values()
         if k in pushes:
             assert (impulse, instant) == pytest.approx(pushes[k], rel=0.02)
         else:
