@@ -37,6 +37,7 @@ from cg_sysid.candidates import (
 )
 from cg_sysid.characterise import what_remains
 from cg_sysid.diagnosis import (
+    Candidate,
     Cause,
     Diagnosis,
     Options,
@@ -203,6 +204,7 @@ class _Search:
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
         self.rounds: list[Round] = []
+        self.instead = ''  # of the small faults, if something else explains as much
 
     def run(self) -> Diagnosis:
         base = self._fit([Task(self.nominal)], 'nominal model')[0]
@@ -328,6 +330,8 @@ class _Search:
             return None
         both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
+        if abs(first.evidence - second.evidence) < both.margin:
+            self.instead = _instead(*winner)
         if first.label == SMALL_FAULTS or first.evidence < second.evidence + both.margin:
             return None
         self._note(contest, first.label)
@@ -513,6 +517,11 @@ class _Search:
         """Those of them that are above the noise."""
         return {c: v for c, v in self._remaining(o).items() if v > (1 + MATERIAL) ** 2}
 
+    def _small_faults(self, final: Outcome) -> list[str]:
+        """What is there of small faults and what else would explain them, in words."""
+        found = _small_faults(final)
+        return [*found, self.instead] if found and self.instead else found
+
     def _conclude(self, nominal: Outcome, final: Outcome) -> Diagnosis:
         unmodelled = None
         if self._left(final):
@@ -548,7 +557,7 @@ class _Search:
             train=tuple(self.train),
             held=tuple(self.held),
             remaining=self._remaining(final),
-            findings=(*_small_faults(final), *_outstanding(final), *final.train.warnings),
+            findings=(*self._small_faults(final), *_outstanding(final), *final.train.warnings),
             unmodelled=unmodelled,
         )  # fmt: skip
 
@@ -590,6 +599,18 @@ def _small_faults(o: Outcome) -> list[str]:
                     f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
                 )
     return found
+
+
+def _instead(candidate: Candidate, o: Outcome) -> str:
+    """That one effect explains as much as all small faults, in words."""
+    numbers = ', '.join(
+        f'{name} = {measured(value, sigma, unit)}'
+        for name, (value, sigma, unit) in parameters_of(o, candidate.label).items()
+    )
+    return (
+        f'{candidate.label} ({numbers}) alone would explain as much as these small faults do: '
+        'records in other set-ups would tell'
+    )
 
 
 def _outstanding(o: Outcome) -> list[str]:
