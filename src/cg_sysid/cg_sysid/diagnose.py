@@ -204,7 +204,8 @@ class _Search:
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
         self.rounds: list[Round] = []
-        self.instead = ''  # of the small faults, if something else explains as much
+        self.instead = ''  # of a small fault, if something else explains as much
+        self.doubted: dict[str, tuple[str, ...]] = {}  # cause -> small faults that explain as much
 
     def run(self) -> Diagnosis:
         base = self._fit([Task(self.nominal)], 'nominal model')[0]
@@ -330,11 +331,18 @@ class _Search:
             return None
         both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
-        if abs(first.evidence - second.evidence) < both.margin:
-            self.instead = _instead(*winner)
-        if first.label == SMALL_FAULTS or first.evidence < second.evidence + both.margin:
+        label = winner[0].label
+        if first.evidence < second.evidence + both.margin:
+            small = sorted(imperfect(faulty.model, faulty.task.bounds))
+            shown = tuple(name for name in small if _shows(faulty, name))
+            if len(shown) < 2:
+                self.instead = _instead(*winner)
+                return None
+            # One cause that looks like several small faults, or several that conspire.
+            self.doubted[label] = shown
+        elif first.label == SMALL_FAULTS:
             return None
-        self._note(contest, first.label)
+        self._note(contest, label)
         return self._refitted(winner[1])
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
@@ -492,6 +500,7 @@ class _Search:
             if len(self._added(final)) > 1:
                 self._note(contest, label)
             cause = _cause(final, label, self._tie(contest, label) or contest)
+            cause = replace(cause, rivals=(*cause.rivals, *self.doubted.get(label, ())))
             causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
@@ -602,13 +611,13 @@ def _small_faults(o: Outcome) -> list[str]:
 
 
 def _instead(candidate: Candidate, o: Outcome) -> str:
-    """That one effect explains as much as all small faults, in words."""
+    """That one effect explains as much as a small fault, in words."""
     numbers = ', '.join(
         f'{name} = {measured(value, sigma, unit)}'
         for name, (value, sigma, unit) in parameters_of(o, candidate.label).items()
     )
     return (
-        f'{candidate.label} ({numbers}) alone would explain as much as these small faults do: '
+        f'{candidate.label} ({numbers}) alone would explain as much as this small fault does: '
         'records in other set-ups would tell'
     )
 

@@ -25,10 +25,14 @@ def _springs(stiffness):
 
 def _records(machine):
     """Four records on springs 1 % stiffer than their notes say."""
+    return _records_on(machine, _springs(202.0))
+
+
+def _records_on(machine, setup):
     found = []
     for k in range(4):
         record = rehearse(
-            f'record_{k}', machine, _springs(202.0), [0.1 - 0.07 * k, -0.1, 0.3, -0.5],
+            f'record_{k}', machine, setup, [0.1 - 0.07 * k, -0.1, 0.3, -0.5],
             [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.4 + 0.1 * k + 0.15 * t) * t)],
             5.0, 0.004, k,
         )  # fmt: skip
@@ -81,6 +85,27 @@ def test_a_cause_is_named_among_small_faults(nominal, effect, values):
         value, sigma, _ = found.causes[0].parameters[name]
         # Four standard deviations, and what integrators differ by.
         assert abs(value - true) < 4 * sigma + 5e-3 * abs(true)
+
+
+PULLED = ('tether_force', 'torque_bias', 'encoder_offset', 'quadratic_friction')
+
+
+def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
+    machine = nominal.with_effect('tether_force', force=3.0)
+    records = _records_on(machine, _springs(200.0))
+    found = diagnose(nominal, records, Options(effects=PULLED, workers=1))
+    assert found.verdict == 'ambiguous'
+    rivals = {'spring_stiffness', 'spring_stiffness@spring1'}
+    assert [(c.label, set(c.rivals)) for c in found.causes] == [('tether_force', rivals)]
+
+
+def test_springs_that_do_not_conspire_are_no_tether(nominal):
+    left, right = _springs(200.0).springs
+    uneven = replace(left, stiffness=202.0), replace(right, stiffness=198.6)
+    records = _records_on(nominal, Setup(springs=uneven))
+    records = [replace(record, setup=_springs(200.0)) for record in records]
+    found = diagnose(nominal, records, Options(effects=PULLED, workers=1))
+    assert (found.verdict, found.causes) == ('consistent', ())
 
 
 def test_small_faults_stay_within_their_bounds(nominal):
