@@ -263,11 +263,20 @@ def summary_of(
 def described(cause: Cause) -> str:
     """A cause with its numbers and rivals, in words."""
     numbers = ', '.join(
-        f'{name} = {value:.3g} +- {sigma:.1g}' + ('' if unit == '1' else f' {unit}')
-        for name, (value, sigma, unit) in cause.parameters.items()
+        f'{name} {_told(cause, name)}' + ('' if unit == '1' else f' {unit}')
+        for name, (_, _, unit) in cause.parameters.items()
     )
     rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
     return f'{cause.label} ({numbers}){rivals}'
+
+
+def _told(cause: Cause, name: str) -> str:
+    """The value of a parameter, or what it ranges over where records have their own."""
+    own = {row[name][0] for row in cause.events.values() if name in row}
+    if len(own) > 1:
+        return f'from {min(own):.3g} to {max(own):.3g}'
+    value, sigma, _ = cause.parameters[name]
+    return f'= {value:.3g} +- {sigma:.1g}'
 
 
 def per_output(fit: Fit) -> np.ndarray:

@@ -1,6 +1,7 @@
 """An encoder that every start zeroes anew: one value for all pieces of a recording."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.identify import fit
 from cg_sysid.rehearse import rehearse
+from cg_sysid.report.wording import event_words
 from cg_sysid.simulation_error import Problem, evaluate, moved, reduced
 from cg_sysid.trial import prepare
 from cg_sysid.unknowns import unknowns_of
@@ -109,6 +111,7 @@ def _diagnosed(nominal, machine, zeros):
 def test_zeros_of_their_own_are_named(nominal, machine):
     found = _diagnosed(nominal, machine, ZEROS)
     assert [(cause.label, cause.rivals) for cause in found.causes] == [('encoder_zero', ())]
+    assert re.search(r'encoder_zero \(zero from -0.01.* to 0.01.* rad\)', found.summary)
     events = found.causes[0].events
     for k, zero in enumerate(ZEROS):
         value, sigma, unit = events[f'recording_{k}']['zero']
@@ -119,3 +122,13 @@ def test_zeros_of_their_own_are_named(nominal, machine):
 def test_one_zero_for_all_is_an_offset(nominal, machine):
     found = _diagnosed(nominal, machine, (0.011,) * 4)
     assert [(cause.label, cause.rivals) for cause in found.causes] == [('encoder_offset', ())]
+
+
+def test_pieces_that_share_a_value_are_told_as_one():
+    def zero(value):
+        return {'zero': {'value': value, 'sigma': 1e-4, 'unit': 'rad'}}
+
+    events = {'a[0..1 s]': zero(0.01), 'a[1..2 s]': zero(0.01), 'b': zero(-0.02)}
+    one, other = event_words({'events': events})
+    assert one == 'in a: zero 10.00 ± 0.10 mrad'
+    assert other == 'in b: zero −20.00 ± 0.10 mrad'

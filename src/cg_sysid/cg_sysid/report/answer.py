@@ -5,7 +5,15 @@ import math
 from cg_sysid.report.function import unmodelled
 from cg_sysid.report.landings import landings
 from cg_sysid.report.markup import Markup, tag
-from cg_sysid.report.wording import VERDICTS, Facts, headline, lead, left_words, parameter_words
+from cg_sysid.report.wording import (
+    VERDICTS,
+    Facts,
+    event_words,
+    headline,
+    lead,
+    left_words,
+    parameter_words,
+)
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
 
 WORTH_NATS = 6.0  # that an experiment must promise to be worth its while
@@ -59,6 +67,7 @@ def _cause(cause: Facts) -> Markup:
     return tag('div',
         tag('h3', sentence(effect_name(cause['name'])), where),
         [tag('p', words, class_='big') for words in parameter_words(cause['parameters'])],
+        [tag('p', words, class_='soft') for words in event_words(cause)],
         tag('p', cause['description'], class_='soft'),
         tag('p', f'{proof}{PLACES.get(cause["place"], "")}.', class_='soft small'),
         [tag('div', tag('b', 'Could also be ', effect_name(r['label'])),

@@ -15,6 +15,7 @@ VERDICTS = {
     'unusable': 'The recordings themselves are broken.',
     'identified': 'Parameters of the model as given, fitted to the recordings.',
 }
+MOST_EVENTS = 12  # values of single recordings that are listed
 ABOVE_NOISE = 2.0  # multiples of the sensor noise from which an error is spoken of
 HINTS = {
     'angle': 'as a missing or wrong force that depends on position would',
@@ -147,6 +148,20 @@ def setup_words(setup: Facts) -> str:
     if springs:
         words.append(f'{springs} spring{"s" if springs > 1 else ""}')
     return ', '.join(words)
+
+
+def event_words(cause: Facts) -> list[str]:
+    """`in swing_1: zero -6.4 ± 0.6 mrad`, one for each recording that has its own value."""
+    told: dict[str, list[str]] = {}
+    for record, values in cause['events'].items():
+        told.setdefault(', '.join(parameter_words(values)), []).append(record)
+    # Where pieces share it, it is the recording's: its name is theirs up to the bracket.
+    found = [
+        f'in {records[0].partition("[")[0] if len(records) > 1 else records[0]}: {words}'
+        for words, records in told.items()
+    ]
+    more = len(found) - MOST_EVENTS
+    return [*found[:MOST_EVENTS], f'and {more} more in diagnosis.json'] if more > 0 else found
 
 
 def parameter_words(parameters: Facts) -> list[str]:
