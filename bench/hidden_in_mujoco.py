@@ -42,6 +42,7 @@ TEETH = 3000.0, 4.0  # N m/rad and N m s/rad of teeth that touch; the library's 
 TURN = 0.01  # rad/s, over which dry friction turns
 OFF = ('c1', 'c2', 'c4', 'c5', 'coulomb_friction.torque', 'viscous_friction.coefficient')
 PUSHED = 1  # the record with a push
+HALF_SINE = np.sqrt(1 / 4 - 2 / np.pi**2)  # standard deviation of a half sine over its length
 CHANNELS = ('imu_angle', 'imu_rate', 'hip_angle')
 
 Channels = dict[str, np.ndarray]
@@ -144,7 +145,7 @@ def secret_of(effect: str, v: Mapping[str, float], leg_length: float) -> Secret:
         'tether_force': lambda: Secret({
             'at_stance': lambda t, angle, rate: v['force'] * leg_length * np.cos(angle)}),
         'external_push': lambda: Secret({'at_stance': lambda t, angle, rate:
-            v['impulse'] * half_sine(t - v['instant'], 3 * v['duration'])
+            v['impulse'] * half_sine(t - v['instant'], v['duration'] / HALF_SINE)
             * leg_length * np.cos(angle)}),
         'spring_damping': lambda: Secret({'spring_damping': v['coefficient']}),
         'encoder_offset': lambda: sensor('hip_angle', lambda x, t: x + v['offset']),
