@@ -18,7 +18,7 @@ from cg_dynamics.effects.unmodelled import COSINES, LearnedEffect
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.candidates import Outcome, Task, chi2, try_candidate
-from cg_sysid.identify import Fit, fit, score
+from cg_sysid.identify import Fit, fit, in_trial, score
 from cg_sysid.jury import Contest, Jury
 from cg_sysid.response import cut, pieces_of, simulated_signals
 from cg_sysid.shape import GRID, function_of, shape_of
@@ -211,8 +211,10 @@ def _variable(effect: LearnedEffect, found: Outcome, sides) -> np.ndarray:
     motions = (*found.train.motions, *found.held.motions)
     return np.concatenate(
         [
-            simulated_signals(found.train.model, trial, motion)[effect.follows]
-            for trial, motion in zip(trials, motions, strict=True)
+            simulated_signals(model, trial, motion)[effect.follows]
+            for trial, (model, motion) in zip(
+                trials, (in_trial(found.train.model, own) for own in motions), strict=True
+            )
         ]
     )
 

@@ -18,6 +18,7 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_sysid.faults import FaultSignal, as_arrays, from_arrays
+from cg_sysid.identify import in_trial
 from cg_sysid.trial import Trial, sensor_matrix
 
 FILE_NAME = 'curves.npz'
@@ -68,7 +69,7 @@ def make_curve(
         trial: The record.
         role: `train`, `held` or `all`.
         before: The model before.
-        before_motion: Free coordinates and rates at the first row, shape (2m,).
+        before_motion: What the trial has of its own there (Fit.motions).
         after: The model after.
         after_motion: The same for the model after.
     """
@@ -93,11 +94,12 @@ def make_curve(
 def _simulated(
     model: Model, trial: Trial, motion: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    model, motion = in_trial(model, motion)
     compiled = compile_model(model, trial.setup)
     p = parameter_vector(model, trial.setup)
-    x0 = compiled.initial_state(motion, trial.inputs[0], p)
-    states = compiled.simulate(trial.time, trial.inputs, x0, p)
-    return compiled.outputs(trial.time, trial.inputs, states, p), states
+    u = trial.inputs_for(compiled.input_names)
+    states = compiled.simulate(trial.time, u, compiled.initial_state(motion, u[0], p), p)
+    return compiled.outputs(trial.time, u, states, p), states
 
 
 def save(

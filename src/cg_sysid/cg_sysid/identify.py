@@ -406,6 +406,13 @@ def _warnings(fit: Fit, bounds: Collection[str]):
                     )
 
 
+def in_trial(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
+    """The model with what a trial has of its own (Fit.motions), and its initial motion, (2m,)."""
+    unknowns = own_unknowns(model)
+    happened = dict(zip((u.name for u in unknowns), own_values(unknowns, own), strict=True))
+    return model.with_values(happened), own[: len(own) - len(unknowns)]
+
+
 def predict(
     model: Model, trial: Trial, motion: np.ndarray, refinement: float = 1.0
 ) -> np.ndarray:
@@ -417,13 +424,11 @@ def predict(
         motion: What the trial has of its own (Fit.motions).
         refinement: As the fit's.
     """
-    own = own_unknowns(model)
-    happened = dict(zip((u.name for u in own), own_values(own, motion), strict=True))
-    model = model.with_values(happened)
+    model, motion = in_trial(model, motion)
     compiled = compile_model(model, trial.setup)
     p = parameter_vector(model, trial.setup)
     u = trial.inputs_for(compiled.input_names)
-    x0 = compiled.initial_state(motion[: len(motion) - len(own)], u[0], p)
+    x0 = compiled.initial_state(motion, u[0], p)
     return compiled.readings(trial.time, u, x0, p, refinement)
 
 

@@ -22,8 +22,7 @@ from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.identify import fit, score
-from cg_sysid.simulation_error import own_values
+from cg_sysid.identify import fit, in_trial, score
 from cg_sysid.trial import Trial, initial_motion
 from cg_sysid.unknowns import Unknown, awake
 
@@ -136,7 +135,7 @@ def pieces_of(
     for (k, piece), motion in zip(cuts, fitted.motions, strict=True):
         compiled = compile_model(awake(probe.model), piece.setup)
         if id(compiled) not in linear:
-            linear[id(compiled)] = _Linear(probe.model, compiled, names, piece.setup, fitted.own)
+            linear[id(compiled)] = _Linear(probe.model, compiled, names, piece.setup)
         made = linear[id(compiled)].piece(piece, motion, k, k >= len(train))
         if made is not None:
             found.append(made)
@@ -176,10 +175,9 @@ class _Linear:
     """The symbolic derivatives of one compiled structure."""
 
     def __init__(
-        self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup,
-        own: Sequence[Unknown],
+        self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup
     ):
-        self.model, self.compiled, self.names, self.own = model, compiled, list(names), own
+        self.model, self.compiled, self.names = model, compiled, list(names)
         e = compiled.equations
         basis = model.mechanism.kinematics(setup).basis
         by_force = ca.solve(e.mass_matrix, basis.T)
@@ -194,9 +192,8 @@ class _Linear:
     def piece(self, piece: Trial, motion: np.ndarray, record: int, held: bool) -> Piece | None:
         """One piece from what it has of its own; None where sensitivities run away."""
         compiled, m, names = self.compiled, self.m, self.names
-        found = zip((u.name for u in self.own), own_values(self.own, motion), strict=True)
-        p = parameter_vector(self.model.with_values(dict(found)), piece.setup)
-        motion = motion[: 2 * m]
+        model, motion = in_trial(self.model, motion)
+        p = parameter_vector(model, piece.setup)
         u = piece.inputs_for(compiled.input_names)
         n, nx = len(piece.time), compiled.nx
         x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)

@@ -1,0 +1,29 @@
+"""Curves of the report: what was simulated, with all that a record has of its own."""
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.curves import make_curve
+from cg_sysid.identify import predict, score
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+
+
+@pytest.mark.parametrize('effect', ['external_push', 'encoder_zero', 'imu_drift', 'imu_lag'])
+def test_a_curve_is_what_the_model_predicts(model_file, effect):
+    nominal = Model.load(model_file)
+    extended = nominal.with_effect(effect)
+    record = rehearse(
+        'record', extended, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
+        [lambda t: 9.0 * np.sin(4.0 * t)], 2.0, 0.004, 1,
+    )  # fmt: skip
+    (trial,) = prepare(nominal, [record])
+    before, after = (score(model, [trial]) for model in (nominal, extended))
+    curve = make_curve(trial, 'all', nominal, before.motions[0], extended, after.motions[0])
+    np.testing.assert_array_equal(curve.before, predict(nominal, trial, before.motions[0]))
+    np.testing.assert_array_equal(curve.after, predict(extended, trial, after.motions[0]))
+    assert curve.position.shape == (len(trial.time), 3)
