@@ -220,7 +220,8 @@ def main():
         print(line, flush=True)
     text = '\n'.join(lines)
     if options.write:
-        command = f'python bench/check_rates.py --seeds {options.seeds}' + ' --quick' * options.quick
+        command = f'python bench/check_rates.py --seeds {options.seeds}'
+        command += ' --quick' if options.quick else ''
         options.write.write_text(
             f'# Faults of recordings: found, and cried wolf\n\nCommand: `{command}` '
             f'({(time.monotonic() - began) / 60:.0f} min on one core). '

@@ -205,7 +205,7 @@ class _Search:
         self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
-        self.doubted: dict[str, tuple[str, ...]] = {}  # cause -> small faults that explain as much
+        self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
 
     def run(self) -> Diagnosis:
         base = self._fit([Task(self.nominal)], 'nominal model')[0]
@@ -333,13 +333,11 @@ class _Search:
         (first, _), (second, _) = both.ranked
         label = winner[0].label
         if first.evidence < second.evidence + both.margin:
-            small = sorted(imperfect(faulty.model, faulty.task.bounds))
-            shown = tuple(name for name in small if _shows(faulty, name))
-            if len(shown) < 2:
+            if len(_shown(faulty)) < 2:
                 self.instead = _instead(*winner)
                 return None
             # One cause that looks like several small faults, or several that conspire.
-            self.doubted[label] = shown
+            self.doubted[label] = replace(faulty, label=SMALL_FAULTS)
         elif first.label == SMALL_FAULTS:
             return None
         self._note(contest, label)
@@ -500,7 +498,8 @@ class _Search:
             if len(self._added(final)) > 1:
                 self._note(contest, label)
             cause = _cause(final, label, self._tie(contest, label) or contest)
-            cause = replace(cause, rivals=(*cause.rivals, *self.doubted.get(label, ())))
+            if label in self.doubted:
+                cause = replace(cause, rivals=(*cause.rivals, *_shown(self.doubted[label])))
             causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
@@ -512,6 +511,10 @@ class _Search:
             return ()
         found = (contest.of(label) for label in cause.rivals)
         rivals = [replace(final, label=cause.label), *(pair[1] for pair in found if pair)]
+        if cause.label in self.doubted:
+            rivals.append(self.doubted[cause.label])
+        if len(rivals) < 2:
+            return ()
         return propose(
             rivals, self.train[0].sigma, self.options.experiments, self.options.workers,
             self.executor, lambda done, total: self.progress('rehearsals', done, total),
@@ -590,6 +593,12 @@ def _may_still_win(
         if not o.train.converged and chi2(o) < IN_REACH * best
         and (label not in gained or chi2(o) - best <= HOPE * gained[label])
     ]  # fmt: skip
+
+
+def _shown(o: Outcome) -> tuple[str, ...]:
+    """Small faults that are there."""
+    small = sorted(imperfect(o.model, o.task.bounds))
+    return tuple(label for label in small if _shows(o, label))
 
 
 def _shows(o: Outcome, label: str) -> bool:

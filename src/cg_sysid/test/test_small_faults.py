@@ -9,6 +9,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
+from cg_sysid.experiments import load_experiment
 from cg_sysid.imperfections import SOUND, imperfect, with_imperfections
 from cg_sysid.rehearse import rehearse
 
@@ -93,10 +94,15 @@ PULLED = ('tether_force', 'torque_bias', 'encoder_offset', 'quadratic_friction')
 def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
     machine = nominal.with_effect('tether_force', force=3.0)
     records = _records_on(machine, _springs(200.0))
-    found = diagnose(nominal, records, Options(effects=PULLED, workers=1))
+    experiments = (load_experiment('legs_tied'),)
+    options = Options(effects=PULLED, workers=1, experiments=experiments)
+    found = diagnose(nominal, records, options)
     assert found.verdict == 'ambiguous'
     rivals = {'spring_stiffness', 'spring_stiffness@spring1'}
     assert [(c.label, set(c.rivals)) for c in found.causes] == [('tether_force', rivals)]
+    # Another pose on the springs tells: they pull with the distance, a tether does not.
+    assert found.causes[0].proposals[0].experiment == 'legs_tied'
+    assert found.causes[0].proposals[0].evidence > 20
 
 
 def test_springs_that_do_not_conspire_are_no_tether(nominal):
