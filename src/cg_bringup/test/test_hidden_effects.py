@@ -6,6 +6,8 @@ through the topics is in test_demo.py, the wide table over magnitudes and seeds 
 bench/hidden_effects.py, and machines simulated by MuJoCo in cg_sysid.
 """
 
+import json
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from cg_dynamics.model import Model
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.bags import read_bag
 from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnose_cli import main
 from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
@@ -90,3 +93,20 @@ def test_nothing_hidden_is_consistent(seed, tmp_path):
     found = diagnose(nominal, recorded(machine, seed, tmp_path), Options(workers=2))
     assert found.verdict == 'consistent', found.summary
     assert not found.causes
+
+
+@pytest.mark.parametrize(
+    'effect', ['external_push', 'friction_drift', 'imu_drift', 'tether_force']
+)
+def test_the_command_line_tells_of_every_kind_of_effect(effect, tmp_path):
+    """Values of a record's own, laws of the time, ties with small faults: up to the report."""
+    hidden = hide(Model.load(model_path(NOMINAL_MODEL)), effect, 61)
+    bags = [str(tmp_path / r.name) for r in recorded(hidden.model, 61, tmp_path)]
+    nominal, out = tmp_path / 'nominal.yaml', tmp_path / 'answer'
+    hidden.nominal.save(nominal)
+    words = ['--model', str(nominal), '--out', str(out), '--workers', '1', '--effects', effect]
+    assert main([*words, *bags]) == 0
+    facts = json.loads((out / 'diagnosis.json').read_text(encoding='utf-8'))
+    assert [cause['label'] for cause in facts['causes']] == [effect]
+    assert bool(facts['causes'][0]['rivals']) == (effect == 'tether_force')
+    assert (out / 'report.html').stat().st_size > 10_000
