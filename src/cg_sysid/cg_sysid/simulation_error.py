@@ -27,7 +27,7 @@ class Problem:
     """Compiled models and constants of one fit.
 
     What a trial has of its own is one vector: its initial motion, then the values of
-    `own_unknowns`; it lies at `places` of the vector of its block. It is believed to lie at
+    `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads`. `refinement` integration steps are taken in place of one.
     """
 
