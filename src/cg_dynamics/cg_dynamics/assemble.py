@@ -38,7 +38,8 @@ class Equations:
         input_names: Names of u: torques, then inputs that effects ask for.
         channels: Output channels, the order of `outputs`.
         coordinates: Number m of free coordinates.
-        largest_step: Longest step in s at which every effect is simulated well.
+        state_scales: Errors of the entries of x that matter alike, shape (nx,).
+        largest_step: Longest step in s with which integrators of fixed steps still do well.
     """
 
     x: ca.SX
@@ -57,6 +58,7 @@ class Equations:
     input_names: tuple[str, ...]
     channels: tuple[str, ...]
     coordinates: int
+    state_scales: tuple[float, ...]
     largest_step: float
 
 
@@ -211,6 +213,10 @@ def assemble(model: Model, setup: Setup) -> Equations:
         input_names=(*mechanism.inputs, *extra_inputs),
         channels=tuple(outputs),
         coordinates=m,
+        state_scales=(
+            *(1.0 for _ in range(2 * m)),
+            *(scale for e in effects for scale in e.state_scales or (1.0,) * len(e.states)),
+        ),
         largest_step=min((e.largest_step for e in effects), default=float('inf')),
     )
 

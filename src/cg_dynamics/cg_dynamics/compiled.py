@@ -38,6 +38,7 @@ FLAGS = (
 )  # fmt: skip
 MAX_COLUMNS = 64
 REFERENCE_STEP = 0.002
+TOLERANCE = 3e-7  # error of a step; play passed a hundred times multiplies it a thousand times
 SMALLEST_STEP = 1e-4
 SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
@@ -246,7 +247,7 @@ class CompiledModel:
             SimulationError: if the state runs away.
         """
         time, u, x0, p = self._checked(time, u, x0, p)
-        return self._states(self._late_rows(time, u, p, 1.0), x0, p, self.step_for(x0, u, p))
+        return self._states(self._late_rows(time, u, p, 1.0), x0, p, 1.0)
 
     def outputs(
         self, time: np.ndarray, u: np.ndarray, states: np.ndarray, p: np.ndarray
@@ -267,14 +268,18 @@ class CompiledModel:
         """What the sensors report along a simulation, shape (n, ny): the `y` of `normal`."""
         time, u, x0, p = self._checked(time, u, x0, p)
         rows = self._late_rows(time, u, p, refinement)
-        states = self._states(rows, x0, p, self.step_for(x0, u, p) / refinement)
+        states = self._states(rows, x0, p, refinement)
         return self._outputs(rows, states, p)[rows.recorded]
 
-    def _states(self, rows: '_Rows', x0: np.ndarray, p: np.ndarray, step: float) -> np.ndarray:
+    def _states(
+        self, rows: '_Rows', x0: np.ndarray, p: np.ndarray, refinement: float
+    ) -> np.ndarray:
         time, n = rows.time, len(rows.time)
         states = np.empty((n, self.nx))
         inputs = _array(rows.inputs)
-        done = self._c.cgm_simulate(n, _array(np.diff(time)), step, inputs, x0, p, states)
+        done = self._c.cgm_simulate(
+            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states
+        )
         if done < n:
             raise SimulationError(
                 f'the state runs away after {time[done - 1] - time[0]:.3f} s', time[done - 1]
@@ -348,8 +353,8 @@ class CompiledModel:
         y = np.full((m, self.ny), np.nan) if keep else None
         j = np.zeros((m, self.ny, nc)) if keep else None
         done = self._c.cgm_normal(
-            m, rows.time, self.step_for(x0, u, p) / refinement, _array(rows.inputs),
-            _array(rows.slope), delay_columns[0], x0, s0, p, nc, column, samples, weight,
+            m, rows.time, *_accuracy(refinement), _array(rows.inputs), _array(rows.slope),
+            delay_columns[0], x0, s0, p, nc, column, samples, weight,
             _array(output_delays), np.array(delay_columns[1:], dtype=np.int32), history,
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip
@@ -411,6 +416,11 @@ def simulate(
     x0 = compiled.initial_state(motion, u[0], p)
     states = compiled.simulate(time, u, x0, p)
     return states, compiled.outputs(time, u, states, p)
+
+
+def _accuracy(refinement: float) -> tuple[float, float]:
+    """Longest step in s, and the error of a step from which it is halved."""
+    return REFERENCE_STEP / refinement, TOLERANCE / refinement**4
 
 
 def _array(a) -> np.ndarray:
@@ -507,6 +517,7 @@ def _source(e: Equations, free: tuple[str, ...]) -> str:
         generator.add(item)
     sizes = {
         'NX': e.x.shape[0],
+        'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
         'NU': e.u.shape[0],
         'NP': e.p.shape[0],
         'NF': len(free),
@@ -546,11 +557,11 @@ def _bind(library: Path) -> ctypes.CDLL:
     maybe = OptionalArray
     loaded.cgm_advance.argtypes = [array, array, array, number, count]
     loaded.cgm_advance.restype = None
-    loaded.cgm_simulate.argtypes = [count, array, number, array, array, array, array]
+    loaded.cgm_simulate.argtypes = [count, array, number, number, array, array, array, array]
     loaded.cgm_outputs.argtypes = [count, array, array, array, array, array, array]
     loaded.cgm_outputs.restype = None
     loaded.cgm_normal.argtypes = [
-        count, array, number, array, array, count, array, array, array, count, whole, array,
-        array, array, whole, array, array, array, array, array, maybe, maybe,
+        count, array, number, number, array, array, count, array, array, array, count, whole,
+        array, array, array, whole, array, array, array, array, array, maybe, maybe,
     ]  # fmt: skip
     return loaded

@@ -15,6 +15,7 @@ from cg_dynamics.assemble import Equations
 
 CHUNK = 128
 STATE_LIMIT = 1e6
+HALVINGS, EASY, STABLE = 5, 0.03, 2.5  # as in rollout.c
 
 
 class InterpretedRollout:
@@ -43,12 +44,10 @@ class InterpretedRollout:
         if n:
             x[:] = path[:, -1]
 
-    def cgm_simulate(self, n: int, dt, largest: float, u, x0, p, X) -> int:
+    def cgm_simulate(self, n: int, dt, largest: float, tolerance: float, u, x0, p, X) -> int:
         """States at all rows; the number of rows before the state ran away."""
-        X[0] = x0
-        row, held, steps = _fine(dt, u, largest)
-        path = self._chain(self._step, x0, held, p, steps)
-        X[1:] = path[:, row].T
+        path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, None)
+        X[:] = path[row]
         return _sane_rows(X)
 
     def cgm_outputs(self, n: int, time, u, p, X, delay, Y) -> None:
@@ -62,7 +61,7 @@ class InterpretedRollout:
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
     def cgm_normal(
-        self, n, time, largest, u, du, delay_column, x0, S0, p, nc, column, measured, weight,
+        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured, weight,
         delay, delay_to, history, H, g, sse, count, Y, Jacobian,
     ) -> int:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
@@ -76,9 +75,10 @@ class InterpretedRollout:
         if delay_column >= 0:
             chain[-1, delay_column] += 1
         start = np.concatenate([x0, np.eye(nx, width).ravel(order='F')])
-        row, held, steps = _fine(np.diff(time), np.hstack([u, du]), largest)
+        _, row, steps = self._paced(np.diff(time), u, p, x0, largest, tolerance, self._decay)
+        held = np.repeat(np.hstack([u, du])[:-1], np.diff(row), axis=0).T
         path = self._chain(self._sensitive_step, start, held, p, steps)
-        rows = np.hstack([start[:, None], path[:, row]]).T
+        rows = np.hstack([start[:, None], path])[:, row].T
         states = np.ascontiguousarray(rows[:, :nx])
         good = _sane_rows(states)
         states = states[:good]
@@ -155,6 +155,53 @@ class InterpretedRollout:
         return _accumulate(state, ca.vertcat(u, du), e.p, h, _runge_kutta(rates, state, h))
 
     @functools.cached_property
+    def _probe(self) -> ca.Function:
+        """State after a step, and the step's error."""
+        e = self.equations
+        u, h = ca.SX.sym('u', self.nu), ca.SX.sym('h')
+        y, k4 = _last_stage(lambda x: self._f(x, u, e.p), e.x, h)
+        scale = ca.DM(e.state_scales) * ca.fmax(1, ca.fabs(e.x))
+        error = ca.mmax(ca.fabs(h / 6 * (k4 - self._f(y, u, e.p))) / scale)
+        return ca.Function('probe', [e.x, u, e.p, h], [ca.cse(y), error])
+
+    @functools.cached_property
+    def _decay(self) -> ca.Function:
+        """Rate at which the sum of all modes decays."""
+        e = self.equations
+        return ca.Function('decay', [e.x, e.u, e.p], [-ca.trace(ca.jacobian(e.rates, e.x))])
+
+    def _paced(self, dt, u, p, x0, largest, tolerance, decay):
+        """Steps halved where they err or, with `decay`, are not stable: `follow` in rollout.c.
+
+        Returns:
+            States before and after all steps (steps + 1, nx), where the rows are among them (n,),
+            and the lengths of the steps.
+        """
+        path, lengths, row = [np.array(x0, float)], [], [0]
+        halved, whole = 0, 1 << HALVINGS
+        for held, interval in zip(u[:-1], dt, strict=True):
+            pieces = max(1, int(np.ceil(interval / largest * (1 - 1e-9))))
+            for _ in range(pieces):
+                done = 0
+                while done < whole:
+                    h, size, x = interval / pieces / (1 << halved), whole >> halved, path[-1]
+                    if decay and halved < HALVINGS and h * float(decay(x, held, p)) > STABLE:
+                        halved += 1
+                        continue
+                    y, error = self._probe(x, held, p, h)
+                    error = float(error) / tolerance
+                    if error > 1 and halved < HALVINGS:
+                        halved += 1
+                        continue
+                    done += size
+                    if error < EASY and halved and done % (2 * size) == 0:
+                        halved -= 1
+                    path.append(np.asarray(y).ravel())
+                    lengths.append(h)
+            row.append(len(lengths))
+        return np.array(path), np.array(row), np.array(lengths)
+
+    @functools.cached_property
     def _hs(self) -> ca.Function:
         e = self.equations
         return ca.Function(
@@ -219,11 +266,16 @@ class InterpretedRollout:
 
 
 def _runge_kutta(rates, x, h):
+    return _last_stage(rates, x, h)[0]
+
+
+def _last_stage(rates, x, h):
+    """Where a step leads, and the slope of its last stage."""
     k1 = rates(x)
     k2 = rates(x + h / 2 * k1)
     k3 = rates(x + h / 2 * k2)
     k4 = rates(x + h * k3)
-    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), k4
 
 
 def _accumulate(x, u, p, h, x_next) -> ca.Function:
@@ -233,16 +285,6 @@ def _accumulate(x, u, p, h, x_next) -> ca.Function:
     X0, U = ca.MX.sym('x', x.shape[0]), ca.MX.sym('u', u.shape[0], CHUNK)
     P, steps = ca.MX.sym('p', p.shape[0]), ca.MX.sym('h', 1, CHUNK)
     return ca.Function('chain', [X0, U, P, steps], [chain(X0, U, ca.repmat(P, 1, CHUNK), steps)])
-
-
-def _fine(dt, u, largest):
-    """Fine steps: index of the last one of each row, input (nu, n) and length of each."""
-    counts = np.maximum(1, np.ceil(dt / largest * (1 - 1e-9)).astype(int))
-    return (
-        np.cumsum(counts) - 1,
-        np.repeat(u[:-1], counts, axis=0).T,
-        np.repeat(dt / counts, counts),
-    )
 
 
 def _sane_rows(states) -> int:

@@ -14,6 +14,9 @@
 
 #define MAX_COLUMNS 64
 #define STATE_LIMIT 1e6
+#define HALVINGS 5
+#define STABLE 2.5 /* step times rate of decay; the method's limit is 2.785 */
+#define EASY 0.03 /* of the tolerance: a step of fourth order twice as long errs 16 times as much */
 
 static int steps_of(double dt, double largest)
 {
@@ -35,32 +38,89 @@ static void rates(const double *x, const double *u, const double *p, double *dx)
     cgm_f(arg, res, 0, w, 0);
 }
 
+/* One Runge-Kutta step from x to y, and the slope of its last stage. */
+static void step(const double *x, const double *u, const double *p, double h, double *y, double *k4)
+{
+    double k1[NX], k2[NX], k3[NX];
+    rates(x, u, p, k1);
+    for (int i = 0; i < NX; i++) y[i] = x[i] + h / 2 * k1[i];
+    rates(y, u, p, k2);
+    for (int i = 0; i < NX; i++) y[i] = x[i] + h / 2 * k2[i];
+    rates(y, u, p, k3);
+    for (int i = 0; i < NX; i++) y[i] = x[i] + h * k3[i];
+    rates(y, u, p, k4);
+    for (int i = 0; i < NX; i++) y[i] = x[i] + h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]);
+}
+
 /* n Runge-Kutta steps of h seconds, in place. */
 void cgm_advance(double *x, const double *u, const double *p, double h, int n)
 {
-    double k1[NX], k2[NX], k3[NX], k4[NX], y[NX];
-    for (int step = 0; step < n; step++) {
-        rates(x, u, p, k1);
-        for (int i = 0; i < NX; i++) y[i] = x[i] + h / 2 * k1[i];
-        rates(y, u, p, k2);
-        for (int i = 0; i < NX; i++) y[i] = x[i] + h / 2 * k2[i];
-        rates(y, u, p, k3);
-        for (int i = 0; i < NX; i++) y[i] = x[i] + h * k3[i];
-        rates(y, u, p, k4);
-        for (int i = 0; i < NX; i++) x[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]);
+    double y[NX], k4[NX];
+    for (int i = 0; i < n; i++) {
+        step(x, u, p, h, y, k4);
+        memcpy(x, y, sizeof y);
+    }
+}
+
+/* Error of a step of h from x to y with the last stage's slope k4, in tolerances: how far from it
+   the solution of third order is that has the slope at y in place of k4. */
+static double error_of(const double *x, const double *y, const double *k4, const double *u,
+                       const double *p, double h, double tolerance)
+{
+    static const double scale[NX] = SCALES;
+    double k5[NX], error = 0;
+    rates(y, u, p, k5);
+    for (int i = 0; i < NX; i++)
+        error = fmax(error, fabs(h / 6 * (k4[i] - k5[i])) / (scale[i] * fmax(1, fabs(x[i]))));
+    return error / tolerance;
+}
+
+/* How far a row's interval is cut: steps are halved where they err, as where teeth meet or
+   friction turns, and doubled where they are easy. */
+typedef struct {
+    int halved; /* times, from row to row */
+    int done;   /* smallest steps of this interval */
+} Pace;
+
+static const int WHOLE = 1 << HALVINGS;
+
+/* Whether a step of this error stands; sets the pace of the next one. */
+static int stands(Pace *pace, double error)
+{
+    const int length = WHOLE >> pace->halved;
+    if (error > 1 && pace->halved < HALVINGS) {
+        pace->halved++;
+        return 0;
+    }
+    pace->done += length;
+    if (error < EASY && pace->halved > 0 && pace->done % (2 * length) == 0) pace->halved--;
+    return 1;
+}
+
+/* h seconds from x, in place. */
+static void follow(double *x, const double *u, const double *p, double h, double tolerance,
+                   Pace *pace)
+{
+    double y[NX], k4[NX];
+    for (pace->done = 0; pace->done < WHOLE;) {
+        const double part = h / (1 << pace->halved);
+        step(x, u, p, part, y, k4);
+        if (stands(pace, error_of(x, y, k4, u, p, part, tolerance))) memcpy(x, y, sizeof y);
     }
 }
 
 /* States at all rows, X (n, NX). Returns the number of rows before the state ran away. */
-int cgm_simulate(int n, const double *dt, double largest, const double *u, const double *x0,
-                 const double *p, double *X)
+int cgm_simulate(int n, const double *dt, double largest, double tolerance, const double *u,
+                 const double *x0, const double *p, double *X)
 {
+    Pace pace = {0};
     memcpy(X, x0, NX * sizeof(double));
     for (int k = 0; k + 1 < n; k++) {
         double *x = X + (k + 1) * NX;
         int m = steps_of(dt[k], largest);
         memcpy(x, x - NX, NX * sizeof(double));
-        cgm_advance(x, u + k * NU, p, dt[k] / m, m);
+        for (int i = 0; i < m; i++)
+            follow(x, u + k * NU, p, dt[k] / m, tolerance, &pace);
         if (!sane(x)) return k + 1;
     }
     return n;
@@ -115,12 +175,13 @@ void cgm_outputs(int n, const double *time, const double *u, const double *p, co
     }
 }
 
-/* dx = f and dS = A S + P, with du/d(delay) feeding column delay_column. */
-static void variational(const double *x, const double *S, const double *u, const double *du,
+/* dx = f and dS = A S + P, with du/d(delay) feeding column delay_column. Returns how fast the sum
+   of all modes decays, -trace A: dry friction or bristles may settle faster than a step. */
+static double variational(const double *x, const double *S, const double *u, const double *du,
                         int delay_column, const double *p, int nc, const int *column, double *dx,
                         double *dS)
 {
-    double A[NX * NX], B[NX * NU], P[NX * NF + 1], w[W];
+    double A[NX * NX], B[NX * NU], P[NX * NF + 1], w[W], decay = 0;
     const double *arg[3] = {x, u, p};
     double *res[4] = {dx, A, B, P};
     cgm_fs(arg, res, 0, w, 0);
@@ -136,27 +197,41 @@ static void variational(const double *x, const double *S, const double *u, const
             if (column[f] >= 0) row[column[f]] += P[i * NF + f];
         if (delay_column >= 0)
             for (int j = 0; j < NU; j++) row[delay_column] += B[i * NU + j] * du[j];
+        decay -= A[i * NX + i];
     }
+    return decay;
 }
 
-/* One step of the variational equations; leaves the rates at its start in k1, s1. */
-static void step_sensitive(double *x, double *S, const double *u, const double *du,
-                           int delay_column, const double *p, int nc, const int *column, double h,
-                           double *k1, double *s1)
+/* `follow` with the variational equations, over the same steps. */
+static void follow_sensitive(double *x, double *S, const double *u, const double *du,
+                             int delay_column, const double *p, int nc, const int *column,
+                             double h, double tolerance, Pace *pace)
 {
-    double k2[NX], k3[NX], k4[NX], y[NX];
-    double s2[NX * MAX_COLUMNS], s3[NX * MAX_COLUMNS], s4[NX * MAX_COLUMNS], T[NX * MAX_COLUMNS];
+    double k1[NX], k2[NX], k3[NX], k4[NX], y[NX];
+    double s1[NX * MAX_COLUMNS], s2[NX * MAX_COLUMNS], s3[NX * MAX_COLUMNS], s4[NX * MAX_COLUMNS],
+        T[NX * MAX_COLUMNS];
     const int ns = NX * nc;
 #define STAGE(K, SK, FACTOR, KN, SN)                                                             \
     for (int i = 0; i < NX; i++) y[i] = x[i] + (FACTOR) * K[i];                                   \
     for (int i = 0; i < ns; i++) T[i] = S[i] + (FACTOR) * SK[i];                                  \
     variational(y, T, u, du, delay_column, p, nc, column, KN, SN);
-    variational(x, S, u, du, delay_column, p, nc, column, k1, s1);
-    STAGE(k1, s1, h / 2, k2, s2)
-    STAGE(k2, s2, h / 2, k3, s3)
-    STAGE(k3, s3, h, k4, s4)
-    for (int i = 0; i < NX; i++) x[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]);
-    for (int i = 0; i < ns; i++) S[i] += h / 6 * (s1[i] + 2 * s2[i] + 2 * s3[i] + s4[i]);
+    for (pace->done = 0; pace->done < WHOLE;) {
+        const double part = h / (1 << pace->halved);
+        const double decay = variational(x, S, u, du, delay_column, p, nc, column, k1, s1);
+        /* A state may rest where its sensitivity would already be unstable. */
+        if (part * decay > STABLE && pace->halved < HALVINGS) {
+            pace->halved++;
+            continue;
+        }
+        STAGE(k1, s1, part / 2, k2, s2)
+        STAGE(k2, s2, part / 2, k3, s3)
+        STAGE(k3, s3, part, k4, s4)
+        for (int i = 0; i < NX; i++)
+            y[i] = x[i] + part / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]);
+        if (!stands(pace, error_of(x, y, k4, u, p, part, tolerance))) continue;
+        memcpy(x, y, sizeof y);
+        for (int i = 0; i < ns; i++) S[i] += part / 6 * (s1[i] + 2 * s2[i] + 2 * s3[i] + s4[i]);
+    }
 }
 
 /* y and its rows of the Jacobian, J (NY, nc), at one state. */
@@ -187,8 +262,8 @@ static void output_sensitive(const double *x, const double *S, const double *u, 
    space for n rows of (x, dx/dt, S, dS/dt), needed only where some delay is positive or free.
    Jacobian (n, NY, nc) and Y (n, NY) are filled if not null.
    Returns the number of rows before the state ran away. */
-int cgm_normal(int n, const double *time, double largest, const double *u, const double *du,
-               int delay_column, const double *x0, const double *S0, const double *p, int nc,
+int cgm_normal(int n, const double *time, double largest, double tolerance, const double *u,
+               const double *du, int delay_column, const double *x0, const double *S0, const double *p, int nc,
                const int *column, const double *measured, const double *weight,
                const double *delay, const int *delay_to, double *history, double *H, double *g,
                double *sse, double *count, double *Y, double *Jacobian)
@@ -199,6 +274,7 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
     const int ns = NX * nc;
     double *hx = history, *hd = hx + (size_t)n * NX, *hS = hd + (size_t)n * NX,
            *hD = hS + (size_t)n * ns;
+    Pace pace = {0};
     int any_late = 0;
     for (int j = 0; j < NY; j++) any_late |= delay[j] > 0 || delay_to[j] >= 0;
     memcpy(x, x0, sizeof x);
@@ -265,7 +341,8 @@ int cgm_normal(int n, const double *time, double largest, const double *u, const
         double dt = time[k + 1] - time[k];
         int m = steps_of(dt, largest);
         for (int i = 0; i < m; i++)
-            step_sensitive(x, S, uk, duk, delay_column, p, nc, column, dt / m, k1, s1);
+            follow_sensitive(x, S, uk, duk, delay_column, p, nc, column, dt / m, tolerance,
+                             &pace);
         if (!sane(x)) return k + 1;
     }
     return n;

@@ -87,7 +87,7 @@ def test_single_steps(pair):
 
 
 def test_runaway_is_found_at_the_same_row(bare):
-    time, torque = np.arange(500) * 0.002, np.full((500, 1), 1e7)
+    time, torque = np.arange(500) * 0.002, np.full((500, 1), 1e13)
     p = parameter_vector(bare, Setup())
     compiled = compile_model(bare, Setup())
     times = []

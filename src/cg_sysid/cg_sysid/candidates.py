@@ -147,7 +147,7 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     label, task = _label(task), _unbound(task)
     longest = max(trial.duration for trial in train)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if _eventful(task) or late or longest < 2 * SCREEN_S:
+    if eventful(task) or late or longest < 2 * SCREEN_S:
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
@@ -180,7 +180,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         known: Mapping[str, Mapping[str, float]] = {
             t.name: task.events[t.name] for t in held if t.name in task.events
         }
-        if _eventful(task):
+        if eventful(task):
             known = seek_events(best.model, held, label, known, _surest(best, label))
         held_score = score(best.model, held, own=known, thorough=task.thorough)
         events = best.own_by_name(train) | held_score.own_by_name(held)
@@ -235,7 +235,7 @@ def cost_of(task: Task) -> int:
 
 
 def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    if _eventful(task):
+    if eventful(task):
         return _event_fit(task, train)
     best = _own_fit(task, train)
     if task.base is None or best.normalised_error <= task.base.normalised_error:
@@ -287,7 +287,7 @@ def _whole(
     )  # fmt: skip
 
 
-def _eventful(task: Task) -> bool:
+def eventful(task: Task) -> bool:
     """Whether the effect is one of which every record has its own."""
     if task.effect is None:
         return False
@@ -304,12 +304,13 @@ def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
         looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
     leads: list[Fit] = []
     for look, model in looks:
-        if not any(_one_minimum(look, lead, model.effects[-1].label) for lead in leads):
+        if not any(one_minimum(look, lead, model.effects[-1].label) for lead in leads):
             leads.append(look)
     return tuple(leads[:FOLLOWED])
 
 
-def _one_minimum(a: Fit, b: Fit, label: str) -> bool:
+def one_minimum(a: Fit, b: Fit, label: str) -> bool:
+    """Whether two fits of an effect ended alike, or will."""
     own = [u.name.startswith(f'{label}.') for u in a.unknowns]
     near = a.normalised_error < SAME * b.normalised_error
     return near and np.allclose(a.values[own], b.values[own], rtol=ALIKE)

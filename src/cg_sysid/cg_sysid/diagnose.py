@@ -22,15 +22,18 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
+    SAME,
     Look,
     Outcome,
     Task,
     candidates_for,
     chi2,
     cost_of,
+    eventful,
     events_of,
     first_seconds,
     look_at,
+    one_minimum,
     parameters_of,
     strained,
     try_candidate,
@@ -50,7 +53,7 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.imperfections import imperfect, with_imperfections
-from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
+from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, samples, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
@@ -70,6 +73,8 @@ SHOWS = 3.0  # standard deviations from which a small fault is there at all
 RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
 HOPE = 10.0  # times what the last rung gained, from which it may still win
+NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
+FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 THOROUGH_ITERATIONS = 72  # of the last fit
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
@@ -203,6 +208,7 @@ class _Search:
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
+        self.looks: dict[tuple, Look | str] = {}  # by _structure
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
@@ -251,8 +257,10 @@ class _Search:
         """The same structure from the file's numbers again, if that comes out better.
 
         What stands as the base of a round has to be as good as it can be, or the next effect is
-        accepted for a better fit of this one.
+        accepted for a better fit of this one. At the noise there is no next round.
         """
+        if settled(o):
+            return o
         task = Task(o.model, events=o.events, bounds=o.task.bounds)
         again = self._fit([task], f'{o.label} again')
         better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
@@ -271,17 +279,34 @@ class _Search:
     def _fitted_thoroughly(self, o: Outcome) -> Outcome:
         task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                     iterations=THOROUGH_ITERATIONS)  # fmt: skip
-        tasks = [replace(task, leads=(o.train,))]
-        for label in self._added(o):
-            # Near the noise no contest asked whether another start leads deeper.
-            effect = o.model.effect(label)
-            without = replace(task, model=o.model.without_effect(label))
-            look = look_at(replace(without, effect=(effect.name, effect.at)), self.train)
-            if isinstance(look, Look):
-                tasks += [replace(look.task, leads=(lead,)) for lead in look.task.leads]
+        tasks = [replace(task, leads=(start.train,)) for start in (o, *self._other_minima(o))]
         title = f'thorough fits of {self._title(self._added(o))}'
         found = [fitted for fitted in self._fit(tasks, title) if isinstance(fitted, Outcome)]
         return min([o, *found], key=chi2)
+
+    def _other_minima(self, o: Outcome) -> list[Outcome]:
+        """The same structure from other starts of its effects, where these may lead deeper.
+
+        Near the noise no contest asked for them.
+        """
+        effects = [o.model.effect(label) for label in sorted(self._added(o))]
+        without = [
+            Task(o.model.without_effect(e.label), (e.name, e.at), o.events, o.task.bounds)
+            for e in effects
+        ]
+        title = f'other starts of {self._title(self._added(o))}'
+        tasks = [
+            replace(look.task, leads=(lead,), iterations=RUNGS[0])
+            for look in self._looked_at(without, title) for lead in look.task.leads
+            if lead.normalised_error < FROM_AFAR * look.error
+        ]  # fmt: skip
+        found = self._fit(tasks, title)
+        near = SAME * o.train.normalised_error
+        return [
+            other for other in found
+            if isinstance(other, Outcome) and other.train.normalised_error < near
+            and not one_minimum(other.train, o.train, other.label)
+        ]  # fmt: skip
 
     def _tie(self, contest: Contest, label: str) -> Contest | None:
         """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
@@ -439,7 +464,17 @@ class _Search:
         """
         looks = self._looked_at(tasks, f'first look at {what}')
         worth = _worth_more(looks)
-        found = self._fitted([replace(t, iterations=RUNGS[0]) for t in worth], what)
+        found = self._fitted(
+            [replace(t, iterations=RUNGS[0]) for t in worth if not eventful(t)], what
+        )
+        if any(chi2(o) < NOTHING_LEFT * samples(o) for o in found.values()):
+            # To seek events in every record takes long.
+            worth = [task for task in worth if not eventful(task)]
+        else:
+            found |= self._fitted(
+                [replace(t, iterations=RUNGS[0]) for t in worth if eventful(t)],
+                f'{what}, events',
+            )
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
             going = _may_still_win(found, gained)
@@ -453,11 +488,14 @@ class _Search:
         return list(found.values()), aside
 
     def _looked_at(self, tasks: list[Task], what: str) -> list[Look]:
-        looks = self.carry_out(look_at, [(task, self.train) for task in tasks], what)
-        for task, look in zip(tasks, looks, strict=True):
+        new = [task for task in tasks if _structure(task) not in self.looks]
+        looks = self.carry_out(look_at, [(task, self.train) for task in new], what)
+        for task, look in zip(new, looks, strict=True):
+            self.looks[_structure(task)] = look
             if isinstance(look, str):
                 log.info('%s: %s', task.effect, look)
-        return [look for look in looks if isinstance(look, Look)]
+        known = [self.looks[_structure(task)] for task in tasks]
+        return [look for look in known if isinstance(look, Look)]
 
     def _fitted(self, tasks: list[Task], what: str) -> dict[str, Outcome]:
         found = {}
@@ -574,6 +612,12 @@ class _Search:
         )  # fmt: skip
 
 
+def _structure(task: Task) -> tuple:
+    """What tells first looks apart: the effects of the base, small faults, and what is tried."""
+    labels = frozenset(effect.label for effect in task.model.effects)
+    return labels, frozenset(task.bounds), task.effect
+
+
 def _worth_more(looks: Sequence[Look]) -> list[Task]:
     """Tasks whose first look is within reach of the best, the longest to fit first."""
     errors = sorted(look.error for look in looks if np.isfinite(look.error))
@@ -588,11 +632,13 @@ def _may_still_win(
 ) -> list[Outcome]:
     """Unfinished fits that are near the best, and do not come nearer too slowly."""
     best = min(map(chi2, found.values()), default=0.0)
-    return [
+    going = [
         o for label, o in found.items()
         if not o.train.converged and chi2(o) < IN_REACH * best
         and (label not in gained or chi2(o) - best <= HOPE * gained[label])
     ]  # fmt: skip
+    # Where nobody else is after it the best has won.
+    return [] if [chi2(o) for o in going] == [best] else going
 
 
 def _shown(o: Outcome) -> tuple[str, ...]:

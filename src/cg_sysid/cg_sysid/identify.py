@@ -38,7 +38,7 @@ BACK = 5  # of these at most
 ACROSS = 1e-3  # damping of that: flat directions stay where they are
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
-REFINED = 4.0  # integration steps of a thorough fit in place of one
+REFINED = 2.0  # integration steps of a thorough fit in place of one
 
 
 @dataclass(frozen=True)

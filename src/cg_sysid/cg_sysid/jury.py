@@ -110,7 +110,7 @@ class Jury:
             for o in outcomes
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
-        white = independent > WHITE * _samples(leader)
+        white = independent > WHITE * samples(leader)
         fine = THOROUGH_FIDELITY if thorough else FIDELITY
         fidelity = fine if white else ROUGH_FIDELITY
         margin = max(MARGIN, fidelity * independent / 2)
@@ -180,9 +180,10 @@ def at_noise(o: Outcome) -> bool:
     return bool((per_output(o.train) < AT_NOISE).all() and (per_output(o.held) < AT_NOISE).all())
 
 
-def _samples(o: Outcome) -> float:
+def samples(o: Outcome) -> float:
+    """Number of samples, training and held-out trials together."""
     return float(o.train.count.sum() + o.held.count.sum())
 
 
 def _evidence(o: Outcome, independent: float) -> float:
-    return evidence(chi2(o), _samples(o), independent, o.unknowns, o.belief)
+    return evidence(chi2(o), samples(o), independent, o.unknowns, o.belief)

@@ -17,6 +17,8 @@ class ActuatorLag(Effect):
         ),
     )  # fmt: skip
     states = ('torque',)
+    # A newton metre that errs for a millisecond turns a joint by some hundredths of a rad/s.
+    state_scales = (1000.0,)
     largest_step = 0.001
 
     def deliver(self, torque, z, p):

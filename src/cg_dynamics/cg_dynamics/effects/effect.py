@@ -113,7 +113,9 @@ class Effect:
         summary: One sentence for people, with the equation in plain text.
         parameters: Declared parameters.
         states: Names of extra states.
-        largest_step: Longest integration step in s at which the effect is still simulated well.
+        state_scales: Error of each extra state that matters as much as one of a rad, or a rad/s,
+            of a joint: steps are controlled by it (rollout.c); by default 1 each.
+        largest_step: Longest step in s with which integrators of fixed steps still do well.
         extra_inputs: Inputs by name that the effect needs; they come with its parameters in `p`.
         wave: Names of an amplitude and a phase, where the opposite amplitude half a turn away is
             the same wave: fits report a positive amplitude and a phase within (-pi, pi].
@@ -127,6 +129,7 @@ class Effect:
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     states: ClassVar[tuple[str, ...]] = ()
+    state_scales: ClassVar[tuple[float, ...]] = ()
     largest_step: ClassVar[float] = float('inf')
     extra_inputs: ClassVar[tuple[str, ...]] = ()
     wave: ClassVar[tuple[str, str] | None] = None

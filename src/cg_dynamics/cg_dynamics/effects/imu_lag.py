@@ -16,6 +16,8 @@ class ImuLag(ImuEffect):
         ),
     )  # fmt: skip
     states = ('angle', 'rate')
+    # Errors stay in the reading: nothing carries them on.
+    state_scales = (30.0, 30.0)
     largest_step = 0.001
 
     def read(self, outputs, z, p):

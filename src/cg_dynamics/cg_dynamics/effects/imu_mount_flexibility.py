@@ -30,6 +30,8 @@ class ImuMountFlexibility(ImuEffect):
         ),
     )  # fmt: skip
     states = ('bend', 'bend_rate')
+    # Errors stay in the reading: nothing carries them on.
+    state_scales = (30.0, 30.0)
     extra_inputs = ('hip_torque',)
     largest_step = 0.001
 
