@@ -22,7 +22,7 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.candidates import Look, Outcome, Task, look_at, own_parameters, try_candidate
-from cg_sysid.diagnose import FIRST_ITERATIONS, split
+from cg_sysid.diagnose import RUNGS, split
 from cg_sysid.trial import prepare
 
 LONG_S, SIX = 20.0, PROGRAMME[:6]
@@ -41,7 +41,7 @@ def attempt(effect, seed, long):
     began = time.monotonic()
     look = look_at(Task(nominal, (effect, None)), train)
     assert isinstance(look, Look), look
-    found = try_candidate(replace(look.task, iterations=FIRST_ITERATIONS), train, held)
+    found = try_candidate(replace(look.task, iterations=sum(RUNGS)), train, held)
     took = time.monotonic() - began
     if not isinstance(found, Outcome):
         return values[effect], found, float('inf'), took

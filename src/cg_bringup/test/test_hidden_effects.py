@@ -32,7 +32,7 @@ PROGRAMME = (
 ) * 2
 DURATION = 6.0  # s
 
-# Effect -> seed. Eight others are hidden in MuJoCo's robot in cg_sysid.
+# Effect -> seed. Five others are hidden in MuJoCo's robot in cg_sysid, all in the benches.
 HIDDEN = {
     'actuator_lag': 12, 'coulomb_friction': 15, 'viscous_friction': 16, 'stribeck_friction': 17,
     'backlash': 20, 'encoder_offset': 23, 'imu_offset': 24, 'sensor_delay': 26,

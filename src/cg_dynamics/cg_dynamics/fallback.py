@@ -61,8 +61,8 @@ class InterpretedRollout:
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
     def cgm_normal(
-        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured, weight,
-        delay, delay_to, history, H, g, sse, count, Y, Jacobian,
+        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
+        weight, delay, delay_to, history, H, g, sse, count, Y, Jacobian,
     ) -> int:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
         nx, ny = self.nx, self.ny

@@ -23,7 +23,7 @@ from cg_sysid.trial import Trial
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
 # so: it is the order of what integrators and interpolation differ by.
 FIDELITY = 1.5e-3
-# The same for thorough fits, whose integration error is two hundred times smaller.
+# The same for thorough fits, whose late torques change at their own instants.
 THOROUGH_FIDELITY = 2e-4
 # A model that leaves more than white noise has something wrong, and small differences say less.
 ROUGH_FIDELITY = 2e-3

@@ -1,7 +1,8 @@
 """Effects hidden in a machine that shares no code with the model: the robot in MuJoCo.
 
 MuJoCo integrates its own rigid bodies at its own step; only signs and angles have the same
-meaning. The robot has no hip body there (mujoco_robot.two_links).
+meaning. The robot has no hip body there (mujoco_robot.two_links). All 31 kinds are in
+bench/hidden_in_mujoco.py.
 """
 
 import numpy as np
@@ -74,17 +75,17 @@ HIDDEN = {
     'payload': {'payload': ('outer', 0.8, 0.5)},
     'joint_flexibility': {'flexibility': (300.0, 0.12, 0.5)},
     'actuator_delay': {'torque_delay': 0.009},
-    'torque_constant': {'torque_gain': 0.88},
-    'torque_bias': {'torque_bias': 0.6},
-    'ground_slope': {'slope': 0.02},
     'gyro_bias': {'offsets': {'imu_rate': 0.04}},
     'quadratic_friction': {'at_hip': lambda t, angle, rate, torque: -0.3 * rate * abs(rate)},
 }
 
+# Late torque and late readings are the same to a machine that does not know what time it is.
+SAME = {'actuator_delay': {'sensor_delay'}}
+
 
 @pytest.mark.parametrize('effect', HIDDEN)
 def test_an_effect_hidden_in_mujoco_is_named(effect):
-    seed = 30 + list(HIDDEN).index(effect)
+    seed = 40 + list(HIDDEN).index(effect)
     nominal, truth = nominal_and_truth(seed)
     hidden = Hidden(
         viscous=truth['viscous_friction.coefficient'],
@@ -99,6 +100,6 @@ def test_an_effect_hidden_in_mujoco_is_named(effect):
     if effect == 'none':
         assert found.verdict == 'consistent', found.summary
         return
-    assert named <= {effect, *(r for c in found.causes for r in c.rivals)}, found.summary
-    assert effect in named | {r for c in found.causes for r in c.rivals}, found.summary
+    rivals = {rival.partition('@')[0] for cause in found.causes for rival in cause.rivals}
+    assert named | rivals == {effect} | SAME.get(effect, set()), found.summary
     assert found.extended.held.normalised_error < 0.5 * found.baseline.held.normalised_error
