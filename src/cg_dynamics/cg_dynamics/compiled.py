@@ -38,7 +38,7 @@ FLAGS = (
 )  # fmt: skip
 MAX_COLUMNS = 64
 REFERENCE_STEP = 0.002
-TOLERANCE = 3e-7  # error of a step; play passed a hundred times multiplies it a thousand times
+TOLERANCE = 3e-7  # error of a step in units of the state scales; play multiplies it
 SMALLEST_STEP = 1e-4
 SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
@@ -163,7 +163,7 @@ class CompiledModel:
         return np.asarray(full).ravel(), np.asarray(by_x)[:, :m2], np.asarray(by_p)
 
     def step_for(self, x0: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:
-        """Longest integration step in s at which this motion is simulated well.
+        """Longest of equal integration steps in s at which this motion is simulated well.
 
         Dry friction, smoothed, is stiffest at standstill under load: there a time constant of
         the linearised model can be far below a sample, and Runge-Kutta's step has to follow it.
@@ -326,7 +326,7 @@ class CompiledModel:
             measured: Outputs, NaN where there is no sample, shape (n, ny).
             weight: 1 / standard deviation of each output, shape (ny,).
             keep: Return the simulated outputs and the Jacobian too.
-            refinement: Integration steps in place of one of `step_for`. If more than one,
+            refinement: Integration steps in place of one (`_accuracy`). If more than one,
                 inputs that come late change at their instants, else a row has their mean.
         """
         time, u, x0, p = self._checked(time, u, x0, p)

@@ -263,7 +263,8 @@ static void output_sensitive(const double *x, const double *S, const double *u, 
    Jacobian (n, NY, nc) and Y (n, NY) are filled if not null.
    Returns the number of rows before the state ran away. */
 int cgm_normal(int n, const double *time, double largest, double tolerance, const double *u,
-               const double *du, int delay_column, const double *x0, const double *S0, const double *p, int nc,
+               const double *du, int delay_column, const double *x0, const double *S0,
+               const double *p, int nc,
                const int *column, const double *measured, const double *weight,
                const double *delay, const int *delay_to, double *history, double *H, double *g,
                double *sse, double *count, double *Y, double *Jacobian)

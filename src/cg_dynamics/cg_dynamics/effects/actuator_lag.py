@@ -17,7 +17,7 @@ class ActuatorLag(Effect):
         ),
     )  # fmt: skip
     states = ('torque',)
-    # A newton metre that errs for a millisecond turns a joint by some hundredths of a rad/s.
+    # A newton metre that errs for a millisecond turns a leg of 1 kg m^2 by a mrad/s.
     state_scales = (1000.0,)
     largest_step = 0.001
 
