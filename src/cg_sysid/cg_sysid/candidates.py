@@ -19,7 +19,7 @@ from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
-SCREEN_S = 2.0  # length of the first look at each start of a candidate
+SCREENS_S = (2.0, 5.0)  # lengths of the first look: the first of them in which the base fails
 MOST_STARTS = 24
 FOLLOWED = 3  # starts that are worth a second look
 FOLLOWING = 8  # iterations of each, before the best of them is chosen
@@ -33,7 +33,7 @@ TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none
 SURE = 5.0  # standard deviations from which an event of a record is not chance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
     """One candidate to fit: an effect (or None for the base alone) on top of a model.
 
@@ -50,6 +50,7 @@ class Task:
         base: Fit of the base. With an effect more it can only be better; where a fit from the
             file's numbers is not, it goes on from there.
         first: Fit of the base to the first seconds, for looks in the same way.
+        reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
     """
 
     model: Model
@@ -61,6 +62,7 @@ class Task:
     thorough: bool = False
     base: Fit | None = None
     first: Fit | None = None
+    reach: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -145,9 +147,8 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
         The look, or a sentence saying why there is none.
     """
     label, task = _label(task), _unbound(task)
-    longest = max(trial.duration for trial in train)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if eventful(task) or late or longest < 2 * SCREEN_S:
+    if eventful(task) or late or not _screens(train):
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
@@ -182,7 +183,9 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         }
         if eventful(task):
             known = seek_events(best.model, held, label, known, _surest(best, label))
-        held_score = score(best.model, held, own=known, thorough=task.thorough)
+        held_score = score(
+            best.model, held, own=known, thorough=task.thorough, reach=task.reach
+        )
         events = best.own_by_name(train) | held_score.own_by_name(held)
         model = believing(best.model, task.model, label)
         residuals = tuple(
@@ -269,7 +272,7 @@ def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
     # excited yet, a gap that is passed once.
     best = _whole(task, model, train, leads[0], FOLLOWING)
     for lead in leads[1:]:
-        if best.normalised_error < SETTLED:
+        if best.normalised_error < SETTLED or lead.normalised_error > task.reach:
             break
         other = _whole(task, model, train, lead, FOLLOWING)
         best = min(best, other, key=lambda found: found.normalised_error)
@@ -283,7 +286,7 @@ def _whole(
     """Fit whole records."""
     return fit(
         model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
-        thorough=task.thorough,
+        thorough=task.thorough, reach=task.reach,
     )  # fmt: skip
 
 
@@ -338,26 +341,42 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     return replace(best, converged=found)
 
 
+def _screens(train: Sequence[Trial]) -> list[float]:
+    """Lengths of first looks that are much shorter than the records."""
+    longest = max(trial.duration for trial in train)
+    return [length for length in SCREENS_S if longest >= 2 * length]
+
+
 def _look(
     task: Task,
     model: Model,
     train: Sequence[Trial],
     only: Sequence[str] | None = None,
     start: Fit | None = None,
+    length: float = SCREENS_S[0],
 ) -> Fit:
-    """A fit to the first seconds of each record."""
+    """A fit to the first seconds of each record: those of the base's own look, if there is one."""
     return fit(
-        model, train, only, horizon=SCREEN_S, iterations=SCREEN_ITERATIONS, start=start,
-        own=task.events, bounds=task.bounds,
+        model, train, only, horizon=task.first.horizon if task.first else length,
+        iterations=SCREEN_ITERATIONS, start=start,
+        own=task.events, bounds=task.bounds, reach=task.reach,
     )  # fmt: skip
 
 
 def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
-    """Fit of a task's base to the first seconds, from its fit to whole records; None without."""
-    try:
-        return _look(task, task.model, train, start=task.base)
-    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
-        return None
+    """Fit of a task's base to the first seconds, from its fit to whole records; None without.
+
+    To so many of them that something is wrong there: where nothing is, nothing can help.
+    """
+    found = None
+    for length in _screens(train):
+        try:
+            found = _look(task, task.model, train, start=task.base, length=length)
+        except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+            break
+        if found.normalised_error > SETTLED:
+            break
+    return found
 
 
 def _swept(model: Model) -> list[str]:

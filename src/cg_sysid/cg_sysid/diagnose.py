@@ -11,7 +11,7 @@ docs/diagnosis.md says how the decisions are taken and why.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -23,20 +23,15 @@ from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
     SAME,
-    Look,
     Outcome,
     Task,
     candidates_for,
     chi2,
-    cost_of,
-    eventful,
     events_of,
     first_seconds,
-    look_at,
     one_minimum,
     parameters_of,
     strained,
-    try_candidate,
 )
 from cg_sysid.characterise import what_remains
 from cg_sysid.diagnosis import (
@@ -53,10 +48,11 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.imperfections import imperfect, with_imperfections
-from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, samples, settled
+from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
+from cg_sysid.race import RUNGS, Race
 from cg_sysid.record import Record
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
@@ -70,13 +66,8 @@ REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
-RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
-IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
-HOPE = 10.0  # times what the last rung gained, from which it may still win
-NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 THOROUGH_ITERATIONS = 72  # of the last fit
-FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
 SMALL_FAULTS = 'small faults'
@@ -205,16 +196,16 @@ class _Search:
         self.nominal, self.options, self.progress = model, options, progress
         self.train, self.held, self.executor = train, held, executor
         self.jury = Jury(train, held)
+        self.race = Race(train, held, self.carry_out)
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
-        self.looks: dict[tuple, Look | str] = {}  # by _structure
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
 
     def run(self) -> Diagnosis:
-        base = self._fit([Task(self.nominal)], 'nominal model')[0]
+        base = self.race.fit([Task(self.nominal)], 'nominal model')[0]
         if isinstance(base, str):
             raise IdentificationError(base)
         final = self._extend(base)
@@ -262,7 +253,7 @@ class _Search:
         if settled(o):
             return o
         task = Task(o.model, events=o.events, bounds=o.task.bounds)
-        again = self._fit([task], f'{o.label} again')
+        again = self.race.fit([task], f'{o.label} again')
         better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
         return replace(better[0], label=o.label) if better else o
 
@@ -281,7 +272,7 @@ class _Search:
                     iterations=THOROUGH_ITERATIONS)  # fmt: skip
         tasks = [replace(task, leads=(start.train,)) for start in (o, *self._other_minima(o))]
         title = f'thorough fits of {self._title(self._added(o))}'
-        found = [fitted for fitted in self._fit(tasks, title) if isinstance(fitted, Outcome)]
+        found = [fitted for fitted in self.race.fit(tasks, title) if isinstance(fitted, Outcome)]
         return min([o, *found], key=chi2)
 
     def _other_minima(self, o: Outcome) -> list[Outcome]:
@@ -297,10 +288,10 @@ class _Search:
         title = f'other starts of {self._title(self._added(o))}'
         tasks = [
             replace(look.task, leads=(lead,), iterations=RUNGS[0])
-            for look in self._looked_at(without, title) for lead in look.task.leads
+            for look in self.race.look(without, title) for lead in look.task.leads
             if lead.normalised_error < FROM_AFAR * look.error
         ]  # fmt: skip
-        found = self._fit(tasks, title)
+        found = self.race.fit(tasks, title)
         near = SAME * o.train.normalised_error
         return [
             other for other in found
@@ -336,7 +327,7 @@ class _Search:
             return o
         model, bounds = with_imperfections(o.model, self._setups())
         title = f'{self._title(self._added(o))}, with small faults'
-        found = self._fit([Task(model, events=o.events, bounds=bounds)], title)[0]
+        found = self.race.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
         if isinstance(found, str):
             log.info('small faults: %s', found)
             return o
@@ -380,7 +371,7 @@ class _Search:
                 model = model.without_effect(label)
                 bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
             task = Task(model, events=final.events, bounds=bounds)
-            lean = self._fit([task], 'without small faults')[0]
+            lean = self.race.fit([task], 'without small faults')[0]
             if isinstance(lean, str):
                 continue
             if self.jury.contest(lean, [final]).ranked[0][0].evidence < EARNED:
@@ -422,7 +413,7 @@ class _Search:
                 bounds = {**bounds, **missing}
             task = Task(model, events=final.events, bounds=bounds)
             known = not others and not bounds
-            lean = nominal if known else self._fit([task], f'model without {label}')[0]
+            lean = nominal if known else self.race.fit([task], f'model without {label}')[0]
             if isinstance(lean, str):
                 log.info('without %s: %s', label, lean)
                 return None
@@ -448,67 +439,11 @@ class _Search:
             )  # fmt: skip
             alone = Task(base.model, None, base.events, bounds, base=base.train)
             alone = replace(alone, first=first_seconds(alone, self.train))
-            tasks = [replace(alone, effect=effect) for effect in effects]
-            # The longest first, or the last of them would be waited for.
-            tasks.sort(key=cost_of, reverse=True)
-            outcomes, aside = self._fit_all(tasks, f'effects on top of {self._title(added)}')
+            title = f'effects on top of {self._title(added)}'
+            outcomes, aside = self.race.run(alone, effects, title)
             contest = self.jury.contest(base, outcomes)
             self.contests[key] = replace(contest, aside=tuple(aside))
         return self.contests[key]
-
-    def _fit_all(self, tasks: list[Task], what: str) -> tuple[list[Outcome], list[str]]:
-        """Fit candidates, ever longer those that may still win.
-
-        Returns:
-            Outcomes of fits to whole records, and labels of those that a first look set aside.
-        """
-        looks = self._looked_at(tasks, f'first look at {what}')
-        worth = _worth_more(looks)
-        found = self._fitted(
-            [replace(t, iterations=RUNGS[0]) for t in worth if not eventful(t)], what
-        )
-        if any(chi2(o) < NOTHING_LEFT * samples(o) for o in found.values()):
-            # To seek events in every record takes long.
-            worth = [task for task in worth if not eventful(task)]
-        else:
-            found |= self._fitted(
-                [replace(t, iterations=RUNGS[0]) for t in worth if eventful(t)],
-                f'{what}, events',
-            )
-        gained: dict[str, float] = {}
-        for iterations in RUNGS[1:]:
-            going = _may_still_win(found, gained)
-            again = self._fitted(
-                [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
-                f'{what}, in more depth',
-            )
-            gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
-            found |= {n: again[n] for n, gain in gained.items() if gain > 0}
-        aside = [look.label for look in looks if not any(look.task is task for task in worth)]
-        return list(found.values()), aside
-
-    def _looked_at(self, tasks: list[Task], what: str) -> list[Look]:
-        new = [task for task in tasks if _structure(task) not in self.looks]
-        looks = self.carry_out(look_at, [(task, self.train) for task in new], what)
-        for task, look in zip(new, looks, strict=True):
-            self.looks[_structure(task)] = look
-            if isinstance(look, str):
-                log.info('%s: %s', task.effect, look)
-        known = [self.looks[_structure(task)] for task in tasks]
-        return [look for look in known if isinstance(look, Look)]
-
-    def _fitted(self, tasks: list[Task], what: str) -> dict[str, Outcome]:
-        found = {}
-        for task, outcome in zip(tasks, self._fit(tasks, what), strict=True):
-            if isinstance(outcome, str):
-                log.info('%s: %s', task.effect, outcome)
-            else:
-                found[outcome.label] = outcome
-        return found
-
-    def _fit(self, tasks: list[Task], what: str) -> list[Outcome | str]:
-        arguments = [(task, self.train, self.held) for task in tasks]
-        return self.carry_out(try_candidate, arguments, what)
 
     def carry_out(self, function: Callable, arguments: list[tuple], what: str) -> list:
         return run_all(
@@ -610,35 +545,6 @@ class _Search:
             findings=(*self._small_faults(final), *_outstanding(final), *final.train.warnings),
             unmodelled=unmodelled,
         )  # fmt: skip
-
-
-def _structure(task: Task) -> tuple:
-    """What tells first looks apart: the effects of the base, small faults, and what is tried."""
-    labels = frozenset(effect.label for effect in task.model.effects)
-    return labels, frozenset(task.bounds), task.effect
-
-
-def _worth_more(looks: Sequence[Look]) -> list[Task]:
-    """Tasks whose first look is within reach of the best, the longest to fit first."""
-    errors = sorted(look.error for look in looks if np.isfinite(look.error))
-    limit = IN_REACH * errors[0] if errors else np.inf
-    limit = max(limit, errors[min(FEWEST, len(errors)) - 1]) if errors else limit
-    worth = [look.task for look in looks if not look.error > limit]
-    return sorted(worth, key=cost_of, reverse=True)
-
-
-def _may_still_win(
-    found: Mapping[str, Outcome], gained: Mapping[str, float]
-) -> list[Outcome]:
-    """Unfinished fits that are near the best, and do not come nearer too slowly."""
-    best = min(map(chi2, found.values()), default=0.0)
-    going = [
-        o for label, o in found.items()
-        if not o.train.converged and chi2(o) < IN_REACH * best
-        and (label not in gained or chi2(o) - best <= HOPE * gained[label])
-    ]  # fmt: skip
-    # Where nobody else is after it the best has won.
-    return [] if [chi2(o) for o in going] == [best] else going
 
 
 def _shown(o: Outcome) -> tuple[str, ...]:

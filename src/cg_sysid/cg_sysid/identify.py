@@ -39,6 +39,19 @@ ACROSS = 1e-3  # damping of that: flat directions stay where they are
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
+PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
+HOPE = 10.0  # times that gain, within which it may still come there
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where a minimisation came to; without a point where the simulation runs away."""
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    point: Point | None
+    converged: bool
+    hopeless: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,6 +138,7 @@ def fit(
     own: Mapping[str, Mapping[str, float]] | None = None,
     bounds: Mapping[str, float] | None = None,
     thorough: bool = False,
+    reach: float = np.inf,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -143,6 +157,7 @@ def fit(
         thorough: Down to the very bottom, at several times the cost: until a tenth of a squared
             standard deviation is all that is left to gain, with finer integration. For values
             that are to be as good as their intervals say.
+        reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -159,29 +174,37 @@ def fit(
     longest = min(max(trial.duration for trial in trials), horizon)
     weight = 1.0 if start is None else 1 / start.inflation
     stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+    found = _Descent(theta, motions, None, False)
     for horizon in stages:
         # The short horizons only lead the way; the belief of the file keeps them sober.
-        found = _minimise(problem, theta, motions, horizon, weight, 12, 3e-2, True)
-        if found[2] is not None:
-            theta, motions = found[0], found[1]
-            weight = _weight(found[2]) if reweight else 1.0
-    at_once = BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS
-    for _ in range(max(1, iterations // at_once)):
-        theta, motions, point, converged = _minimise(
-            problem, theta, motions, longest, weight, at_once, 0.0 if thorough else DRIFT
+        ahead = _minimise(
+            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
         )
-        if point is None:
+        if ahead.point is not None:
+            found = ahead
+            weight = _weight(ahead.point) if reweight else 1.0
+        if found.hopeless:
+            iterations = 0
+            break
+    at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
+    for _ in range(max(1, iterations // max(1, at_once))):
+        found = _minimise(
+            problem, found.theta, found.motions, longest, weight, at_once,
+            0.0 if thorough else DRIFT, reach,
+        )  # fmt: skip
+        if found.point is None:
             raise IdentificationError(
                 f'model {model.name!r} runs away along the data '
                 f'({", ".join(t.name for t in trials)}); its values are too far off, or the '
                 'records are too long for an unstable motion: cut them into windows'
             )
-        new = _weight(point) if reweight else 1.0
+        new = _weight(found.point) if reweight else 1.0
         # A minimum under weights that are about to change is none yet.
-        converged = converged and bool(abs(np.log(new / weight)) < STEADY)
-        if converged:
+        converged = found.converged and bool(abs(np.log(new / weight)) < STEADY)
+        if converged or found.hopeless:
             break
         weight = new
+    theta, motions, point = found.theta, found.motions, found.point
     assert point is not None
     values = problem.values(theta)
     covariance, information, own_sigmas = uncertainty(problem, theta, motions, longest, weight)
@@ -227,15 +250,17 @@ def _minimise(
     weight: float,
     iterations: int,
     drift: float,
+    reach: float,
     leading: bool = False,
-) -> tuple[np.ndarray, list[np.ndarray], Point | None, bool]:
+) -> _Descent:
     lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
                       for u in problem.unknowns])
     upper = np.array([u.to_coordinate(u.upper) for u in problem.unknowns])
     point = evaluate(problem, theta, motions, horizon, weight)
     if point is None:
-        return theta, motions, None, False
+        return _Descent(theta, motions, None, False)
     damping = 1e-3
+    errors = []
 
     def frozen(theta, point):
         """Unknowns that stay where they are, shape (k,)."""
@@ -258,6 +283,9 @@ def _minimise(
         return reached, there_own, there.beside(BARRIER, barrier) if there is not None else None
 
     for _ in range(iterations):
+        errors.append(point.sse.sum() / point.count.sum())
+        if _out_of_reach(errors, reach):
+            return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
         for _ in range(BACK):
             if candidate is None or not point.cost < candidate.cost < UPHILL * point.cost:
@@ -275,17 +303,26 @@ def _minimise(
             little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
             # A short step gains little too.
             if little and _promised(point, frozen(theta, point)) < small:
-                return theta, motions, point.beside(barrier, BARRIER), True
+                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier
         else:
             if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:
-                return theta, motions, point.beside(barrier, BARRIER), True
+                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
             damping *= 10
             if damping > 1e8:
                 # No step is short enough: a minimum, or a corner of what bodies can be.
-                return theta, motions, point.beside(barrier, BARRIER), candidate is not None
-    return theta, motions, point.beside(barrier, BARRIER), False
+                return _Descent(
+                    theta, motions, point.beside(barrier, BARRIER), candidate is not None
+                )
+    return _Descent(theta, motions, point.beside(barrier, BARRIER), False)
+
+
+def _out_of_reach(errors: Sequence[float], reach: float) -> bool:
+    """Whether errors that fell like this will not soon come to what matters."""
+    if len(errors) <= PATIENCE:
+        return False
+    return errors[-1] - reach > HOPE * (errors[-1 - PATIENCE] - errors[-1])
 
 
 def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:
@@ -437,10 +474,11 @@ def score(
     trials: Sequence[Trial],
     own: Mapping[str, Mapping[str, float]] | None = None,
     thorough: bool = False,
+    reach: float = np.inf,
 ) -> Fit:
     """How well a model simulates trials that it was not fitted to.
 
     Only what each trial has of its own is fitted: its initial motion, as no recording states it
     exactly, and what happened in it alone, from the guess `own` (see `fit`).
     """
-    return fit(model, trials, only=(), own=own, thorough=thorough)
+    return fit(model, trials, only=(), own=own, thorough=thorough, reach=reach)

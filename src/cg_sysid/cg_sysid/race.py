@@ -1,0 +1,182 @@
+"""The race of all candidates on top of one model: who is fitted, in what order, and how far.
+
+    first look (a few seconds of each record), the light ones before the heavy
+      -> those that look best are fitted to whole records, then all others within reach
+      -> ever longer fits of those that may still win
+
+What one comes to is what the next are measured by: a fit out of reach that gains little is broken
+off, so that a library of effects costs little more than those of them that matter.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cg_sysid.candidates import (
+    Look,
+    Outcome,
+    Task,
+    chi2,
+    cost_of,
+    eventful,
+    look_at,
+    try_candidate,
+)
+from cg_sysid.jury import samples
+from cg_sysid.trial import Trial
+
+log = logging.getLogger(__name__)
+
+RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
+IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
+NEAR = 3.0  # the same where that error is the noise
+HOPE = 10.0  # times what the last rung gained, from which it may still win
+NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
+FAVOURED = 2.0  # times the best look's error, up to which a candidate is fitted first
+HELPS = 0.5  # share of what is wrong in the first seconds, below which something helps there
+MUCH = 1.5  # chi2/N of a model of which much is wrong
+HEAVY = 10  # cost from which a candidate is looked at when the others have been
+FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
+
+CarryOut = Callable[[Callable, list[tuple], str], list]
+Effects = Sequence[tuple[str, str | None]]
+
+
+class Race:
+    """Fits of candidates on the trials of one diagnosis.
+
+    Args:
+        train: Trials to fit.
+        held: Trials held out.
+        carry_out: Does independent pieces of work: (function, arguments of each, what) -> results.
+    """
+
+    def __init__(self, train: Sequence[Trial], held: Sequence[Trial], carry_out: CarryOut):
+        self.train, self.held, self.carry_out = train, held, carry_out
+        self.looks: dict[tuple, Look | str] = {}  # by _structure
+
+    def fit(self, tasks: Sequence[Task], what: str) -> list[Outcome | str]:
+        """Fits to whole records, in the order of the tasks; a sentence for one that failed."""
+        return self.carry_out(try_candidate, [(t, self.train, self.held) for t in tasks], what)
+
+    def look(self, tasks: Sequence[Task], what: str) -> list[Look]:
+        """First looks, without those that failed; what was looked at is known."""
+        new = [task for task in tasks if _structure(task) not in self.looks]
+        looks = self.carry_out(look_at, [(task, self.train) for task in new], what)
+        for task, look in zip(new, looks, strict=True):
+            self.looks[_structure(task)] = look
+            if isinstance(look, str):
+                log.info('%s: %s', task.effect, look)
+        known = [self.looks[_structure(task)] for task in tasks]
+        return [look for look in known if isinstance(look, Look)]
+
+    def run(self, base: Task, effects: Effects, what: str) -> tuple[list[Outcome], list[str]]:
+        """Fit every effect on top of a base.
+
+        Args:
+            base: The task of the base, with its fits.
+            effects: Effects and places.
+            what: For the progress.
+
+        Returns:
+            Outcomes of fits to whole records, and labels of those that were not worth one.
+        """
+        tasks = [replace(base, effect=effect, iterations=RUNGS[0]) for effect in effects]
+        events = [task for task in tasks if eventful(task)]
+        others = [task for task in tasks if not eventful(task)]
+        looking = f'first look at {what}'
+        looks = self.look(_longest_first(t for t in others if cost_of(t) < HEAVY), looking)
+        found: dict[str, Outcome] = {}
+        if _comes_later(base, looks):
+            found = self._fitted(events, f'{what}, events')
+            events = []
+        reach = min(_reach(found), IN_REACH * _smallest(looks))
+        heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
+        looks += self.look(_longest_first(heavy), looking)
+        tried: set[str] = set()
+        for limit in (FAVOURED * _smallest(looks), np.inf):
+            reach = _reach(found)
+            heat = [look for look in _worth_more(looks, reach)
+                    if look.label not in tried and _known(look) <= limit]  # fmt: skip
+            tried.update(look.label for look in heat)
+            found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
+        # To seek events in every record takes long.
+        if not any(chi2(o) < NOTHING_LEFT * samples(o) for o in found.values()):
+            found |= self._fitted(events, f'{what}, events')
+        gained: dict[str, float] = {}
+        for iterations in RUNGS[1:]:
+            going = _may_still_win(found, gained)
+            again = self._fitted(
+                [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
+                f'{what}, in more depth',
+            )
+            gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
+            found |= {n: again[n] for n, gain in gained.items() if gain > 0}
+        return list(found.values()), [look.label for look in looks if look.label not in tried]
+
+    def _fitted(self, tasks: Iterable[Task], what: str) -> dict[str, Outcome]:
+        found, tasks = {}, _longest_first(tasks)
+        for task, outcome in zip(tasks, self.fit(tasks, what), strict=True):
+            if isinstance(outcome, str):
+                log.info('%s: %s', task.effect, outcome)
+            else:
+                found[outcome.label] = outcome
+        return found
+
+
+def _structure(task: Task) -> tuple:
+    """What tells first looks apart: the effects of the base, small faults, and what is tried."""
+    labels = frozenset(effect.label for effect in task.model.effects)
+    return labels, frozenset(task.bounds), task.effect
+
+
+def _longest_first(tasks: Iterable[Task]) -> list[Task]:
+    """Or the last of them would be waited for."""
+    return sorted(tasks, key=cost_of, reverse=True)
+
+
+def _known(look: Look) -> float:
+    """Its error; infinite where the first seconds cannot tell."""
+    return look.error if np.isfinite(look.error) else np.inf
+
+
+def _smallest(looks: Iterable[Look]) -> float:
+    return min(map(_known, looks), default=np.inf)
+
+
+def _reach(found: Mapping[str, Outcome]) -> float:
+    """chi2/N within which a fit may still win over what was found."""
+    best = min((o.train.normalised_error for o in found.values()), default=np.inf)
+    return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
+
+
+def _comes_later(base: Task, looks: Sequence[Look]) -> bool:
+    """Whether much is wrong and nothing helps in the first seconds: an event, perhaps."""
+    if base.base is None or base.first is None or base.base.normalised_error < MUCH:
+        return False
+    return _smallest(looks) - 1 > HELPS * (base.first.normalised_error - 1)
+
+
+def _worth_more(looks: Sequence[Look], reach: float) -> list[Look]:
+    """Looks within reach of the best, and those that cannot tell."""
+    errors = sorted(filter(np.isfinite, map(_known, looks)))
+    if not errors:
+        return list(looks)
+    limit = max(min(reach, IN_REACH * errors[0]), errors[min(FEWEST, len(errors)) - 1])
+    return [look for look in looks if not look.error > limit]
+
+
+def _may_still_win(
+    found: Mapping[str, Outcome], gained: Mapping[str, float]
+) -> list[Outcome]:
+    """Unfinished fits that are near the best, and do not come nearer too slowly."""
+    best = min(map(chi2, found.values()), default=0.0)
+    going = [
+        o for label, o in found.items()
+        if not o.train.converged and chi2(o) < IN_REACH * best
+        and (label not in gained or chi2(o) - best <= HOPE * gained[label])
+    ]  # fmt: skip
+    # Where nobody else is after it the best has won.
+    return [] if [chi2(o) for o in going] == [best] else going
