@@ -11,7 +11,7 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.events import seek_events
+from cg_sysid.events import seek_events, undisturbed
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.trial import Trial
@@ -324,6 +324,7 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     best = task.leads[0] if task.leads else None
     settled = best or fit(task.model, train, own=task.events, bounds=task.bounds)
     nothing = settled.normalised_error
+    settled = best or undisturbed(task.model, train, task.bounds) or settled
     for _ in range(SEEKINGS if best else 1):
         # What was a push is at first taken for other parameters: seek again when it is not.
         at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}

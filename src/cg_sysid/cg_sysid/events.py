@@ -13,12 +13,20 @@ from scipy.signal import find_peaks
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.model import Model
-from cg_sysid.identify import Fit, fit
-from cg_sysid.trial import Trial
+from cg_sysid.identify import Fit, fit, score
+from cg_sysid.imperfections import Bounds
+from cg_sysid.trial import Trial, pieces
 from cg_sysid.unknowns import IdentificationError, awake, own_unknowns
 
 GRID_S = 0.2
+PIECE_S = 2.0  # of a record, in most of which nothing happens
+KEPT = 0.75  # share of the pieces that is kept at least
+QUIET = 1.2  # chi2/N of pieces that are all kept
+TRIMMINGS = 3  # times that a fit chooses its pieces
+PIECE_ITERATIONS = 8
+BEFORE_S = 0.5  # of a spoilt piece: what happened may have begun there
 FOLLOWED = 3  # peaks from which a fit goes on
 
 
@@ -51,6 +59,39 @@ def seek_events(
         trial.name: seeking.beside(trial, guess.event)
         for trial, guess in zip(trials, guesses, strict=True)
     }
+
+
+def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | None:
+    """Fit of a model to those pieces of the records in which nothing happens.
+
+    An event that the model does not have pulls at all its numbers, and with such numbers it is
+    not found. It spoils few pieces: the others are those that can be simulated (least trimmed
+    squares).
+
+    Returns:
+        None where that makes no sense: many pieces cannot be simulated down to the noise
+        (something is wrong all the time), or all can.
+    """
+    if own_unknowns(model) or any(TIME in effect.extra_inputs for effect in model.effects):
+        return None  # pieces would have to share what belongs to a record
+    whole = [piece for t in trials for _, piece in pieces(model.mechanism, t, PIECE_S)]
+    kept, found = whole, None
+    try:
+        for _ in range(TRIMMINGS):
+            found = fit(model, kept, bounds=bounds, iterations=PIECE_ITERATIONS)
+            errors = _piece_errors(found.model, whole)
+            quiet = max(QUIET, float(np.quantile(errors, KEPT)))
+            kept = [piece for piece, e in zip(whole, errors, strict=True) if e <= quiet]
+    except IdentificationError:
+        return None
+    spoilt = len(whole) - len(kept)
+    return found if spoilt and quiet == QUIET else None
+
+
+def _piece_errors(model: Model, found: Sequence[Trial]) -> np.ndarray:
+    """chi2/N of each piece."""
+    fitted = score(model, found)
+    return np.nansum(fitted.mse * fitted.count, axis=1) / fitted.count.sum(axis=1)
 
 
 @dataclass(frozen=True)
@@ -118,7 +159,7 @@ def _small_events(
     x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
     s0 = np.column_stack([by_motion, np.zeros(compiled.nx)])
     column = np.where(np.array(compiled.free) == names[0], m2, -1)
-    grid = np.arange(0.0, trial.duration, GRID_S)
+    grid = _instants(model.with_values({names[0]: 0.0}), trial)
     gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
     for k, t in enumerate(grid):
         p[instant] = t
@@ -134,3 +175,13 @@ def _small_events(
     peaks, _ = find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
     return [np.array([sizes[k], grid[k]]) for k in order[:FOLLOWED]]
+
+
+def _instants(model: Model, trial: Trial) -> np.ndarray:
+    """Instants in s at which something may have happened: all, or those about spoilt pieces."""
+    grid = np.arange(0.0, trial.duration, GRID_S)
+    begins, found = zip(*pieces(model.mechanism, trial, PIECE_S), strict=True)
+    errors = _piece_errors(model, found)
+    spoilt = np.array(begins)[errors > QUIET * max(1.0, float(np.median(errors)))]
+    near = (grid[:, None] > spoilt - BEFORE_S) & (grid[:, None] < spoilt + PIECE_S)
+    return grid[near.any(axis=1)] if len(spoilt) else grid

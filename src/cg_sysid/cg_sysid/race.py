@@ -24,6 +24,7 @@ from cg_sysid.candidates import (
     look_at,
     try_candidate,
 )
+from cg_sysid.events import undisturbed
 from cg_sysid.jury import samples
 from cg_sysid.trial import Trial
 
@@ -89,9 +90,8 @@ class Race:
         looking = f'first look at {what}'
         looks = self.look(_longest_first(t for t in others if cost_of(t) < HEAVY), looking)
         found: dict[str, Outcome] = {}
-        if _comes_later(base, looks):
-            found = self._fitted(events, f'{what}, events')
-            events = []
+        if events and _nothing_helps(base, looks) and self._happened(base, what):
+            found, events = self._fitted(events, f'{what}, events'), []
         reach = min(_reach(found), IN_REACH * _smallest(looks))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
@@ -115,6 +115,11 @@ class Race:
             gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
             found |= {n: again[n] for n, gain in gained.items() if gain > 0}
         return list(found.values()), [look.label for look in looks if look.label not in tried]
+
+    def _happened(self, base: Task, what: str) -> bool:
+        """Whether few pieces of the records are spoilt and all others are as they should be."""
+        arguments = [(base.model, self.train, base.bounds)]
+        return self.carry_out(undisturbed, arguments, f'{what}, piece by piece')[0] is not None
 
     def _fitted(self, tasks: Iterable[Task], what: str) -> dict[str, Outcome]:
         found, tasks = {}, _longest_first(tasks)
@@ -152,11 +157,12 @@ def _reach(found: Mapping[str, Outcome]) -> float:
     return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
 
 
-def _comes_later(base: Task, looks: Sequence[Look]) -> bool:
-    """Whether much is wrong and nothing helps in the first seconds: an event, perhaps."""
+def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
+    """Whether much is wrong that nothing explains in the first seconds."""
     if base.base is None or base.first is None or base.base.normalised_error < MUCH:
         return False
-    return _smallest(looks) - 1 > HELPS * (base.first.normalised_error - 1)
+    first = base.first.normalised_error
+    return first < MUCH or _smallest(looks) - 1 > HELPS * (first - 1)
 
 
 def _worth_more(looks: Sequence[Look], reach: float) -> list[Look]:

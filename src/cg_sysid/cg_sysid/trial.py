@@ -5,8 +5,9 @@ can be matched at all, and a first guess of the motion at the first row.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -130,6 +131,30 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
         motion=motion,
         motion_sigma=motion_sigma,
     )
+
+
+def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Trial]]:
+    """The trial cut into consecutive pieces of a length in s, each with a motion of its own.
+
+    Returns:
+        When each begins, in s, and the piece.
+    """
+    cuts = np.searchsorted(trial.time, np.arange(0.0, trial.duration, length))
+    found = []
+    for a, b in itertools.pairwise([*cuts, len(trial.time)]):
+        time = trial.time[a:b] - trial.time[a]
+        if b - a < 2 or time[-1] < length / 2:
+            continue
+        outputs = trial.outputs[a:b]
+        motion, spread = trial.motion, trial.motion_sigma
+        if a > 0:
+            motion, spread = initial_motion(body, trial.setup, time, outputs, trial.sigma)
+        piece = replace(
+            trial, name=f'{trial.name}[{a}:{b}]', time=time, inputs=trial.inputs[a:b],
+            outputs=outputs, motion=motion, motion_sigma=spread,
+        )  # fmt: skip
+        found.append((float(trial.time[a]), piece))
+    return found
 
 
 @functools.cache
