@@ -22,7 +22,7 @@ from cg_sysid.unknowns import IdentificationError, awake, own_unknowns
 
 GRID_S = 0.2
 PIECE_S = 2.0  # of a record, in most of which nothing happens
-KEPT = 0.75  # share of the pieces that is kept at least
+KEPT = 0.5  # share of the pieces that is kept at least
 QUIET = 1.2  # chi2/N of pieces that are all kept
 TRIMMINGS = 3  # times that a fit chooses its pieces
 PIECE_ITERATIONS = 8
@@ -80,7 +80,7 @@ def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | 
         for _ in range(TRIMMINGS):
             found = fit(model, kept, bounds=bounds, iterations=PIECE_ITERATIONS)
             errors = _piece_errors(found.model, whole)
-            quiet = max(QUIET, float(np.quantile(errors, KEPT)))
+            quiet = max(QUIET, float(np.quantile(errors, KEPT, method='lower')))
             kept = [piece for piece, e in zip(whole, errors, strict=True) if e <= quiet]
     except IdentificationError:
         return None

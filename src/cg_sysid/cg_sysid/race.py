@@ -36,7 +36,6 @@ NEAR = 3.0  # the same where that error is the noise
 HOPE = 10.0  # times what the last rung gained, from which it may still win
 NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
 FAVOURED = 2.0  # times the best look's error, up to which a candidate is fitted first
-HELPS = 0.5  # share of what is wrong in the first seconds, below which something helps there
 MUCH = 1.5  # chi2/N of a model of which much is wrong
 HEAVY = 10  # cost from which a candidate is looked at when the others have been
 FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
@@ -92,12 +91,12 @@ class Race:
         found: dict[str, Outcome] = {}
         if events and _nothing_helps(base, looks) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
-        reach = min(_reach(found), IN_REACH * _smallest(looks))
+        reach = _reach(min(_best(found), _smallest(looks)))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (FAVOURED * _smallest(looks), np.inf):
-            reach = _reach(found)
+            reach = _reach(_best(found))
             heat = [look for look in _worth_more(looks, reach)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
             tried.update(look.label for look in heat)
@@ -151,9 +150,12 @@ def _smallest(looks: Iterable[Look]) -> float:
     return min(map(_known, looks), default=np.inf)
 
 
-def _reach(found: Mapping[str, Outcome]) -> float:
-    """chi2/N within which a fit may still win over what was found."""
-    best = min((o.train.normalised_error for o in found.values()), default=np.inf)
+def _best(found: Mapping[str, Outcome]) -> float:
+    return min((o.train.normalised_error for o in found.values()), default=np.inf)
+
+
+def _reach(best: float) -> float:
+    """chi2/N within which a fit may still win over one that came to `best`."""
     return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
 
 
@@ -161,8 +163,7 @@ def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
     """Whether much is wrong that nothing explains in the first seconds."""
     if base.base is None or base.first is None or base.base.normalised_error < MUCH:
         return False
-    first = base.first.normalised_error
-    return first < MUCH or _smallest(looks) - 1 > HELPS * (first - 1)
+    return base.first.normalised_error < MUCH or _smallest(looks) > MUCH
 
 
 def _worth_more(looks: Sequence[Look], reach: float) -> list[Look]:

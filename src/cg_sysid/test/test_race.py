@@ -1,0 +1,104 @@
+"""What keeps the race of all candidates short, and does not decide it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.candidates import Task, first_seconds, try_candidate
+from cg_sysid.events import undisturbed
+from cg_sysid.identify import fit
+from cg_sysid.race import Race
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values
+
+
+@pytest.fixture(scope='module')
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+def _machine(nominal, *effects):
+    machine = nominal.with_values({n: x * nominal.values[n] for n, x in OFF.items()})
+    for name, values in effects:
+        machine = machine.with_effect(name, **values)
+    return machine
+
+
+def _trials(nominal, machine, seconds=8.0):
+    records = [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.1 * t) * t)],
+            seconds, 0.004, k,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    return prepare(nominal, records)
+
+
+PUSH = ('external_push', {'impulse': -3.0, 'instant': 4.3, 'duration': 0.1})
+
+
+def test_a_fit_out_of_reach_is_broken_off(nominal):
+    trials = _trials(nominal, _machine(nominal, PUSH))
+    patient, hasty = (fit(nominal, trials, reach=reach) for reach in (np.inf, 3.0))
+    assert hasty.evaluations < patient.evaluations
+    assert not hasty.converged
+    assert min(hasty.normalised_error, patient.normalised_error) > 30.0  # both are hopeless
+
+
+def test_a_fit_that_comes_into_reach_is_not(nominal):
+    trials = _trials(nominal, _machine(nominal))
+    patient, hasty = (fit(nominal, trials, reach=reach) for reach in (np.inf, 3.0))
+    np.testing.assert_array_equal(hasty.values, patient.values)
+    assert hasty.converged
+
+
+def test_numbers_of_pieces_that_nothing_spoils(nominal):
+    machine = _machine(nominal, PUSH)
+    trials = _trials(nominal, machine)
+    calm, spoilt = undisturbed(nominal, trials, {}), fit(nominal, trials)
+    away = {
+        name: [abs(f.model.values[name] / machine.values[name] - 1) for f in (calm, spoilt)]
+        for name in OFF
+    }
+    # Six of eight pieces of 2 s say as much as their own intervals claim.
+    sigmas = dict(zip((u.name for u in calm.unknowns), calm.sigmas, strict=True))
+    for name, (calm_error, _) in away.items():
+        assert calm_error < 4 * sigmas[name] / machine.values[name]
+    assert max(b for _, b in away.values()) > 3 * max(a for a, _ in away.values())
+
+
+@pytest.mark.parametrize(
+    'effects', [(), (('coulomb_friction', {'torque': 1.5}),), (('payload', {'mass': 1.0}),)]
+)
+def test_what_is_wrong_all_the_time_did_not_happen(nominal, effects):
+    bare = nominal.without_effect('coulomb_friction')
+    assert undisturbed(bare, _trials(bare, _machine(bare, *effects)), {}) is None
+
+
+def test_an_event_is_sought_before_all_others_are_fitted(nominal):
+    trials = _trials(nominal, _machine(nominal, PUSH), seconds=10.0)
+    done = []
+
+    def carry_out(function, arguments, what):
+        done.append(what.rpartition(', ')[2])
+        return [function(*a) for a in arguments]
+
+    train, held = trials[:1], trials[1:]
+    base = try_candidate(Task(nominal), train, held)
+    task = Task(nominal, base=base.train)
+    task = replace(task, first=first_seconds(task, train))
+    names = ('external_push', 'gyro_bias', 'torque_bias', 'imu_offset')
+    found, _ = Race(train, held, carry_out).run(task, [(n, None) for n in names], 'race')
+    best = min(found, key=lambda o: o.train.normalised_error)
+    assert best.label == 'external_push'
+    assert best.held.normalised_error == pytest.approx(1.0, abs=0.05)
+    assert done.index('events') == min(k for k, w in enumerate(done) if w in ('events', 'race'))
