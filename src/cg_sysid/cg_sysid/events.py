@@ -180,8 +180,11 @@ def _small_events(
 def _instants(model: Model, trial: Trial) -> np.ndarray:
     """Instants in s at which something may have happened: all, or those about spoilt pieces."""
     grid = np.arange(0.0, trial.duration, GRID_S)
-    begins, found = zip(*pieces(model.mechanism, trial, PIECE_S), strict=True)
-    errors = _piece_errors(model, found)
-    spoilt = np.array(begins)[errors > QUIET * max(1.0, float(np.median(errors)))]
+    found = pieces(model.mechanism, trial, PIECE_S)
+    try:
+        errors = _piece_errors(model, [piece for _, piece in found])
+    except IdentificationError:
+        return grid  # too short for pieces, or none can be simulated
+    spoilt = np.array([begin for begin, _ in found])[errors > QUIET * max(1.0, float(np.median(errors)))]
     near = (grid[:, None] > spoilt - BEFORE_S) & (grid[:, None] < spoilt + PIECE_S)
     return grid[near.any(axis=1)] if len(spoilt) else grid

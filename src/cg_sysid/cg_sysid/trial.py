@@ -136,18 +136,21 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
 def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Trial]]:
     """The trial cut into consecutive pieces of a length in s, each with a motion of its own.
 
+    A rest shorter than half of that is left out, and so is what begins without samples.
+
     Returns:
         When each begins, in s, and the piece.
     """
     cuts = np.searchsorted(trial.time, np.arange(0.0, trial.duration, length))
     found = []
     for a, b in itertools.pairwise([*cuts, len(trial.time)]):
-        time = trial.time[a:b] - trial.time[a]
+        time, outputs = trial.time[a:b] - trial.time[a], trial.outputs[a:b]
         if b - a < 2 or time[-1] < length / 2:
             continue
-        outputs = trial.outputs[a:b]
         motion, spread = trial.motion, trial.motion_sigma
         if a > 0:
+            if np.isfinite(outputs[time <= START_WINDOW]).sum(axis=0).max() < 3:
+                continue  # samples are missing there
             motion, spread = initial_motion(body, trial.setup, time, outputs, trial.sigma)
         piece = replace(
             trial, name=f'{trial.name}[{a}:{b}]', time=time, inputs=trial.inputs[a:b],

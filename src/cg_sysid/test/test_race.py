@@ -8,12 +8,12 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, first_seconds, try_candidate
+from cg_sysid.candidates import Task, first_seconds, own_parameters, try_candidate
 from cg_sysid.events import undisturbed
 from cg_sysid.identify import fit
 from cg_sysid.race import Race
 from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.trial import pieces, prepare
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values
@@ -44,6 +44,24 @@ def _trials(nominal, machine, seconds=8.0):
 
 
 PUSH = ('external_push', {'impulse': -3.0, 'instant': 4.3, 'duration': 0.1})
+
+
+def test_pieces_leave_out_what_begins_without_samples(nominal):
+    trial = _trials(nominal, nominal, seconds=6.5)[0]
+    gap = (trial.time > 1.9) & (trial.time < 2.1)
+    spoilt = replace(trial, outputs=np.where(gap[:, None], np.nan, trial.outputs))
+    found = pieces(nominal.mechanism, spoilt, 2.0)
+    assert [begin for begin, _ in found] == pytest.approx([0.0, 4.0], abs=0.005)
+    assert not pieces(nominal.mechanism, _trials(nominal, nominal, seconds=0.6)[0], 2.0)
+
+
+def test_a_push_in_records_too_short_for_pieces(nominal):
+    machine = _machine(nominal, ('external_push', {**PUSH[1], 'instant': 0.4}))
+    train, held = ([trial] for trial in _trials(nominal, machine, seconds=0.9))
+    outcome = try_candidate(Task(nominal, ('external_push', None)), train, held)
+    # One second says little about the lumps, and what they lack the push makes up for.
+    assert own_parameters(outcome)['impulse'][0] == pytest.approx(-3.0, rel=0.1)
+    assert own_parameters(outcome)['instant'][0] == pytest.approx(0.4, abs=0.01)
 
 
 def test_a_fit_out_of_reach_is_broken_off(nominal):
