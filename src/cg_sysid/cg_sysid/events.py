@@ -185,6 +185,7 @@ def _instants(model: Model, trial: Trial) -> np.ndarray:
         errors = _piece_errors(model, [piece for _, piece in found])
     except IdentificationError:
         return grid  # too short for pieces, or none can be simulated
-    spoilt = np.array([begin for begin, _ in found])[errors > QUIET * max(1.0, float(np.median(errors)))]
+    bad = errors > QUIET * max(1.0, float(np.median(errors)))
+    spoilt = np.array([begin for begin, _ in found])[bad]
     near = (grid[:, None] > spoilt - BEFORE_S) & (grid[:, None] < spoilt + PIECE_S)
     return grid[near.any(axis=1)] if len(spoilt) else grid
