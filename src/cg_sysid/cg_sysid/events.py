@@ -14,6 +14,7 @@ from scipy.signal import find_peaks
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects.effect import TIME
+from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.identify import Fit, fit, score
 from cg_sysid.imperfections import Bounds
@@ -82,7 +83,7 @@ def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | 
             errors = _piece_errors(found.model, whole)
             quiet = max(QUIET, float(np.quantile(errors, KEPT, method='lower')))
             kept = [piece for piece, e in zip(whole, errors, strict=True) if e <= quiet]
-    except IdentificationError:
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
         return None
     spoilt = len(whole) - len(kept)
     return found if spoilt and quiet == QUIET else None

@@ -145,7 +145,7 @@ def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Tr
     found = []
     for a, b in itertools.pairwise([*cuts, len(trial.time)]):
         time, outputs = trial.time[a:b] - trial.time[a], trial.outputs[a:b]
-        if b - a < 2 or time[-1] < length / 2:
+        if b - a < 2 or time[-1] < length / 2 or not np.isfinite(outputs).any():
             continue
         motion, spread = trial.motion, trial.motion_sigma
         if a > 0:

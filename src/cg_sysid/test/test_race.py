@@ -52,6 +52,10 @@ def test_pieces_leave_out_what_begins_without_samples(nominal):
     spoilt = replace(trial, outputs=np.where(gap[:, None], np.nan, trial.outputs))
     found = pieces(nominal.mechanism, spoilt, 2.0)
     assert [begin for begin, _ in found] == pytest.approx([0.0, 4.0], abs=0.005)
+    missing = replace(trial, outputs=np.where(trial.time[:, None] < 2.0, np.nan, trial.outputs))
+    assert [begin for begin, _ in pieces(nominal.mechanism, missing, 2.0)] == pytest.approx(
+        [2.0, 4.0], abs=0.005
+    )
     assert not pieces(nominal.mechanism, _trials(nominal, nominal, seconds=0.6)[0], 2.0)
 
 
