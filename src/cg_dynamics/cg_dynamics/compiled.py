@@ -45,9 +45,12 @@ STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstab
 
 
 def cache_directory() -> Path:
-    """Where compiled models are kept; CG_CACHE overrides the user's cache directory."""
-    default = Path(os.environ.get('XDG_CACHE_HOME', Path.home() / '.cache')) / 'compass_gait'
-    return Path(os.environ.get('CG_CACHE', default))
+    """Where compiled models are kept; CG_CACHE overrides the user's cache directory.
+
+    Absolute, as a library that is named by its file alone is looked for in the system's places.
+    """
+    default = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'compass_gait'
+    return Path(os.environ.get('CG_CACHE') or default).absolute()
 
 
 @functools.cache

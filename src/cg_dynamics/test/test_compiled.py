@@ -231,6 +231,19 @@ def test_library_is_built_once_and_found_again(bare, tmp_path, monkeypatch):
     assert len(list(tmp_path.glob('*.so'))) == 2
 
 
+def test_library_may_be_kept_in_a_relative_directory(bare, tmp_path, monkeypatch):
+    if module.compiler() is None:
+        pytest.skip('no C compiler on this machine')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('CG_CACHE', '.')
+    monkeypatch.setattr(module, '_built', {})
+    compile_model(bare, Setup())
+    assert len(list(tmp_path.glob('*.so'))) == 1
+    monkeypatch.setenv('CG_CACHE', '')
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    assert module.cache_directory() == tmp_path / 'cache' / 'compass_gait'
+
+
 def test_arrays_of_wrong_shape_are_refused(bare):
     compiled, p = compile_model(bare, Setup()), parameter_vector(bare, Setup())
     good = {'time': TIME, 'u': TORQUE, 'x0': np.zeros(4), 'p': p}
