@@ -154,7 +154,7 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
         leads = _first_seconds(task, train)
         if task.first is not None and leads[0].normalised_error > task.first.normalised_error:
             model = next(_starting_models(task))
-            beyond = _look(task, model, train, start=_beyond(task.first, model, task))
+            beyond = _look(task, model, train, start=started_from(task.first, model, task.bounds))
             leads = tuple(sorted([beyond, *leads], key=lambda lead: lead.normalised_error))
             leads = leads[:FOLLOWED]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
@@ -244,22 +244,23 @@ def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
     if task.base is None or best.normalised_error <= task.base.normalised_error:
         return best
     model = next(_starting_models(task))
-    again = _whole(task, model, train, _beyond(task.base, model, task), task.iterations)
+    start = started_from(task.base, model, task.bounds)
+    again = _whole(task, model, train, start, task.iterations)
     return min(best, again, key=lambda found: found.normalised_error)
 
 
-def _beyond(base: Fit, model: Model, task: Task) -> Fit:
-    """The base's fit as a start for the model with an effect more, that at its own start."""
-    known = {u.name: v for u, v in zip(base.unknowns, base.values, strict=True)}
-    unknowns = unknowns_of(model, bounds=task.bounds)
+def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
+    """A fit as a start for a model of other effects; what it has not is where the model says."""
+    known = {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)}
+    unknowns = unknowns_of(model, bounds=bounds)
     own = own_unknowns(model)
     motions = []
-    for motion in base.motions:
-        first = len(motion) - len(base.own)
-        known_own = {u.name: v for u, v in zip(base.own, motion[first:], strict=True)}
+    for motion in found.motions:
+        first = len(motion) - len(found.own)
+        known_own = {u.name: v for u, v in zip(found.own, motion[first:], strict=True)}
         motions.append(np.array([*motion[:first], *(known_own.get(u.name, u.prior) for u in own)]))
-    values = np.array([known.get(u.name, u.prior) for u in unknowns])
-    return replace(base, unknowns=unknowns, values=values, own=own, motions=tuple(motions))
+    values = np.array([np.clip(known.get(u.name, u.prior), u.lower, u.upper) for u in unknowns])
+    return replace(found, unknowns=unknowns, values=values, own=own, motions=tuple(motions))
 
 
 def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
@@ -378,6 +379,21 @@ def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
         if found.normalised_error > SETTLED:
             break
     return found
+
+
+def deeper(task: Task, lead: Fit, train: Sequence[Trial]) -> Fit | None:
+    """Fit of a task's base to the first seconds from where an effect more has led its numbers.
+
+    Returns:
+        The fit, if it lies clearly deeper than the base's own; None otherwise.
+    """
+    assert task.first is not None
+    start = started_from(lead, task.model, task.bounds)
+    try:
+        found = _look(task, task.model, train, start=start)
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return None
+    return found if SAME * found.normalised_error < task.first.normalised_error else None
 
 
 def _swept(model: Model) -> list[str]:

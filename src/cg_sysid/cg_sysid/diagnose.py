@@ -31,6 +31,7 @@ from cg_sysid.candidates import (
     first_seconds,
     one_minimum,
     parameters_of,
+    started_from,
     strained,
 )
 from cg_sysid.characterise import what_remains
@@ -52,7 +53,7 @@ from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
-from cg_sysid.race import RUNGS, Race
+from cg_sysid.race import RUNGS, Effects, Race
 from cg_sysid.record import Record
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
@@ -62,6 +63,7 @@ log = logging.getLogger(__name__)
 
 LEAD_IN_S = 0.1  # of each record, not judged
 LEAD_IN_SHARE = 0.05  # of a short record
+DEEPER = 3  # times that a base is asked for deeper minima
 REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
@@ -233,7 +235,7 @@ class _Search:
             winner = None
             if not settled(o):
                 contest = self._contest(o)
-                winner = contest.winner()
+                o, winner = contest.base, contest.winner()
                 self._note(contest, winner[0].label if winner else '')
             if winner is not None:
                 o = self._refitted(winner[1])
@@ -341,10 +343,10 @@ class _Search:
         """
         if faulty is plain or settled(plain):
             return None
-        contest = self._contest(plain)
-        winner = contest.winner()
+        contest = self._contest(plain, faulty.train.normalised_error)
+        plain, winner = contest.base, contest.winner()
         if winner is None:
-            return None
+            return plain if settled(plain) else None
         both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
         label = winner[0].label
@@ -370,7 +372,8 @@ class _Search:
             for label in gone:
                 model = model.without_effect(label)
                 bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
-            task = Task(model, events=final.events, bounds=bounds)
+            start = started_from(final.train, model, bounds)
+            task = Task(model, events=final.events, bounds=bounds, leads=(start,))
             lean = self.race.fit([task], 'without small faults')[0]
             if isinstance(lean, str):
                 continue
@@ -427,7 +430,8 @@ class _Search:
             contest = self.contests[key] = replace(again, aside=contest.aside)
         return contest
 
-    def _contest(self, base: Outcome) -> Contest:
+    def _contest(self, base: Outcome, beaten: float = np.inf) -> Contest:
+        """The library in competition on top of a base, and with what came to chi2/N `beaten`."""
         added = self._added(base)
         key = added, bool(base.task.bounds)
         if key not in self.contests:
@@ -437,13 +441,37 @@ class _Search:
                 base.model, self._setups(), self.options.effects, recorded,
                 imperfect(base.model, bounds),
             )  # fmt: skip
-            alone = Task(base.model, None, base.events, bounds, base=base.train)
-            alone = replace(alone, first=first_seconds(alone, self.train))
             title = f'effects on top of {self._title(added)}'
-            outcomes, aside = self.race.run(alone, effects, title)
+            base, alone = self._led_deeper(base, effects, title)
+            outcomes, aside = ([], []) if settled(base) else self.race.run(
+                alone, effects, title, beaten
+            )
             contest = self.jury.contest(base, outcomes)
             self.contests[key] = replace(contest, aside=tuple(aside))
         return self.contests[key]
+
+    def _led_deeper(
+        self, base: Outcome, effects: Effects, title: str
+    ) -> tuple[Outcome, Task]:
+        """A base, or the deeper minimum of it that effects on top of it showed; and its task."""
+        alone = self._alone(base)
+        for _ in range(DEEPER):
+            lead = None if settled(base) else self.race.lead_deeper(alone, effects, title)
+            if lead is None:
+                break
+            task = replace(alone, leads=(lead,), base=None)
+            deeper = self.race.fit([task], f'{self._title(self._added(base))}, deeper')[0]
+            if isinstance(deeper, str) or SAME * chi2(deeper) > chi2(base):
+                break
+            self.race.forget(alone)
+            base = replace(deeper, label=base.label)
+            alone = self._alone(base)
+        return base, alone
+
+    def _alone(self, base: Outcome) -> Task:
+        """The task of a base by itself, with its fits."""
+        task = Task(base.model, None, base.events, base.task.bounds, base=base.train)
+        return replace(task, first=first_seconds(task, self.train))
 
     def carry_out(self, function: Callable, arguments: list[tuple], what: str) -> list:
         return run_all(

@@ -1,13 +1,19 @@
-"""Independent pieces of work on the cores of this machine, results in order."""
+"""Independent pieces of work on the cores of this machine, results in order.
+
+Many pieces go to processes. One alone stays in this process and has all cores for itself: what it
+does record by record goes to threads, as compiled simulations run beside Python.
+"""
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextvars import ContextVar
 from typing import Any
 
 _pool: ProcessPoolExecutor | None = None
+_threads: ContextVar[ThreadPoolExecutor | None] = ContextVar('threads', default=None)
 
 
 def run_all(
@@ -22,22 +28,47 @@ def run_all(
     Args:
         function: Importable, with arguments and result that can be pickled.
         arguments: One tuple per call.
-        workers: Local processes; by default one per core, 0 or 1 to stay in this process.
+        workers: Local processes; by default one per core, 0 or 1 to stay on one core.
         executor: Use this instead.
         progress: Called with (done, total).
     """
     total = len(arguments)
-    if executor is None and (total < 2 or (workers is not None and workers < 2)):
+    cores = (os.cpu_count() or 1) if workers is None else workers
+    if executor is None and cores < 2:
         results = []
         for done, a in enumerate(arguments, start=1):
             results.append(function(*a))
             progress(done, total)
+        return results
+    if executor is None and total == 1:
+        results = [_with_threads(cores, function, *arguments[0])]
+        progress(1, 1)
         return results
     futures = [(executor or _local(workers)).submit(function, *a) for a in arguments]
     for done, future in enumerate(as_completed(futures), start=1):
         future.result()
         progress(done, total)
     return [future.result() for future in futures]
+
+
+def side_by_side(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterable[Any]:
+    """function(item) for each, in order, on the cores that this piece of work has for itself.
+
+    Args:
+        function: Spends its time outside Python and changes nothing that another call reads.
+        items: What for.
+    """
+    threads = _threads.get()
+    return map(function, items) if threads is None else threads.map(function, items)
+
+
+def _with_threads(cores: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    with ThreadPoolExecutor(cores) as threads:
+        token = _threads.set(threads)
+        try:
+            return function(*arguments)
+        finally:
+            _threads.reset(token)
 
 
 def _local(workers: int | None) -> ProcessPoolExecutor:

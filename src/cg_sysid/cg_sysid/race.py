@@ -15,16 +15,21 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.candidates import (
+    FOLLOWED,
+    SAME,
+    SETTLED,
     Look,
     Outcome,
     Task,
     chi2,
     cost_of,
+    deeper,
     eventful,
     look_at,
     try_candidate,
 )
 from cg_sysid.events import undisturbed
+from cg_sysid.identify import Fit
 from cg_sysid.jury import samples
 from cg_sysid.trial import Trial
 
@@ -36,9 +41,12 @@ NEAR = 3.0  # the same where that error is the noise
 HOPE = 10.0  # times what the last rung gained, from which it may still win
 NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
 FAVOURED = 2.0  # times the best look's error, up to which a candidate is fitted first
+MOST = 3.0  # an error that is so many times smaller is mostly explained
+IDLE = 0.7  # share of the base's error that leaves what explains next to nothing
 MUCH = 1.5  # chi2/N of a model of which much is wrong
 HEAVY = 10  # cost from which a candidate is looked at when the others have been
-FEWEST = 8  # candidates that are fitted to whole records whatever the first look says
+FIRST_FEW = 8  # of the light candidates, that may show that the base was in a local minimum
+FEWEST = 5  # candidates that are fitted to whole records whatever the first look says
 
 CarryOut = Callable[[Callable, list[tuple], str], list]
 Effects = Sequence[tuple[str, str | None]]
@@ -72,41 +80,45 @@ class Race:
         known = [self.looks[_structure(task)] for task in tasks]
         return [look for look in known if isinstance(look, Look)]
 
-    def run(self, base: Task, effects: Effects, what: str) -> tuple[list[Outcome], list[str]]:
+    def run(
+        self, base: Task, effects: Effects, what: str, beaten: float = np.inf
+    ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
 
         Args:
             base: The task of the base, with its fits.
             effects: Effects and places.
             what: For the progress.
+            beaten: chi2/N that is to be beaten.
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
         """
-        tasks = [replace(base, effect=effect, iterations=RUNGS[0]) for effect in effects]
+        tasks = _on_top(base, effects)
         events = [task for task in tasks if eventful(task)]
         others = [task for task in tasks if not eventful(task)]
         looking = f'first look at {what}'
-        looks = self.look(_longest_first(t for t in others if cost_of(t) < HEAVY), looking)
+        looks = self.look(_light(others), looking)
         found: dict[str, Outcome] = {}
         if events and _nothing_helps(base, looks) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
-        reach = _reach(min(_best(found), _smallest(looks)))
+        reach = NEAR * min(_best(found), _smallest(looks), beaten)
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (FAVOURED * _smallest(looks), np.inf):
-            reach = _reach(_best(found))
-            heat = [look for look in _worth_more(looks, reach)
+            reach = _reach(min(_best(found), beaten))
+            heat = [look for look in _worth_more(looks, reach, base.first)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
             tried.update(look.label for look in heat)
             found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
-        # To seek events in every record takes long.
-        if not any(chi2(o) < NOTHING_LEFT * samples(o) for o in found.values()):
+        # To seek events in every record takes long: first what explains most of the error.
+        most = base.base.normalised_error / MOST if base.base else 0.0
+        if _best(found) > max(NOTHING_LEFT, most):
             found |= self._fitted(events, f'{what}, events')
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
-            going = _may_still_win(found, gained)
+            going = _may_still_win(found, gained, beaten)
             again = self._fitted(
                 [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
@@ -114,6 +126,39 @@ class Race:
             gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
             found |= {n: again[n] for n, gain in gained.items() if gain > 0}
         return list(found.values()), [look.label for look in looks if look.label not in tried]
+
+    def lead_deeper(self, base: Task, effects: Effects, what: str) -> Fit | None:
+        """Where the base's own numbers come to in the first seconds with one effect more.
+
+        An effect more may be no more than a way out of a local minimum of the base: play has
+        many, and whatever is put on top of it would seem to help.
+
+        Args:
+            base: The task of the base, with its fits.
+            effects: Effects and places.
+            what: For the progress.
+
+        Returns:
+            A fit of the base alone that lies deeper than its own, if there is one.
+        """
+        if base.first is None:
+            return None
+        light = _light(_on_top(base, effects))
+        found: list[Fit] = []
+        # Many lead the same way: the first few may do.
+        for tasks in (light[-FIRST_FEW:], light[:-FIRST_FEW]):
+            looks = self.look(tasks, f'first look at {what}')
+            limit = base.first.normalised_error / SAME
+            best = sorted((k for k in looks if _known(k) < limit), key=_known)[:FOLLOWED]
+            arguments = [(base, look.task.leads[0], self.train) for look in best]
+            found += filter(None, self.carry_out(deeper, arguments, f'{what}, and without them'))
+            if any(fit.normalised_error < SETTLED for fit in found):
+                break
+        return min(found, key=lambda fit: fit.normalised_error, default=None)
+
+    def forget(self, base: Task) -> None:
+        """Looks at what stands on top of a base, which set out from its values."""
+        self.looks = {key: look for key, look in self.looks.items() if key[:2] != _of(base)}
 
     def _happened(self, base: Task, what: str) -> bool:
         """Whether few pieces of the records are spoilt and all others are as they should be."""
@@ -131,9 +176,22 @@ class Race:
 
 
 def _structure(task: Task) -> tuple:
-    """What tells first looks apart: the effects of the base, small faults, and what is tried."""
-    labels = frozenset(effect.label for effect in task.model.effects)
-    return labels, frozenset(task.bounds), task.effect
+    """What tells first looks apart: the base, and what is tried on top of it."""
+    return *_of(task), task.effect
+
+
+def _of(base: Task) -> tuple:
+    """What tells bases apart: their effects and small faults."""
+    return frozenset(effect.label for effect in base.model.effects), frozenset(base.bounds)
+
+
+def _on_top(base: Task, effects: Effects) -> list[Task]:
+    return [replace(base, effect=effect, iterations=RUNGS[0]) for effect in effects]
+
+
+def _light(tasks: Iterable[Task]) -> list[Task]:
+    """Those that are looked at before the heavy ones, the longest first."""
+    return _longest_first(t for t in tasks if not eventful(t) and cost_of(t) < HEAVY)
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
@@ -166,23 +224,30 @@ def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
     return base.first.normalised_error < MUCH or _smallest(looks) > MUCH
 
 
-def _worth_more(looks: Sequence[Look], reach: float) -> list[Look]:
-    """Looks within reach of the best, and those that cannot tell."""
+def _worth_more(looks: Sequence[Look], reach: float, first: Fit | None) -> list[Look]:
+    """Looks within reach of the best, and those that cannot tell.
+
+    Where something explains most of the base's error in the first seconds, what explains nothing
+    of it can wait for the next round.
+    """
     errors = sorted(filter(np.isfinite, map(_known, looks)))
     if not errors:
         return list(looks)
-    limit = max(min(reach, IN_REACH * errors[0]), errors[min(FEWEST, len(errors)) - 1])
+    reach = min(reach, IN_REACH * errors[0])
+    if first is not None and errors[0] < first.normalised_error / MOST:
+        reach = min(reach, IDLE * first.normalised_error)
+    limit = max(reach, errors[min(FEWEST, len(errors)) - 1])
     return [look for look in looks if not look.error > limit]
 
 
 def _may_still_win(
-    found: Mapping[str, Outcome], gained: Mapping[str, float]
+    found: Mapping[str, Outcome], gained: Mapping[str, float], beaten: float
 ) -> list[Outcome]:
     """Unfinished fits that are near the best, and do not come nearer too slowly."""
     best = min(map(chi2, found.values()), default=0.0)
     going = [
         o for label, o in found.items()
-        if not o.train.converged and chi2(o) < IN_REACH * best
+        if not o.train.converged and chi2(o) < IN_REACH * min(best, beaten * samples(o))
         and (label not in gained or chi2(o) - best <= HOPE * gained[label])
     ]  # fmt: skip
     # Where nobody else is after it the best has won.

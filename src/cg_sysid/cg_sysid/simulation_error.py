@@ -15,6 +15,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, Normal, compile_model
 from cg_dynamics.model import Model
+from cg_sysid.parallel import side_by_side
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import Unknown, awake, own_unknowns
 
@@ -209,8 +210,11 @@ def evaluate(
         jacobian = jacobian * chain / c[:, None]
         border = Border(-2 * np.log(c).sum(), -jacobian.sum(axis=0), jacobian.T @ jacobian)
     problem.evaluations += 1
-    for i in range(len(problem.trials)):
-        n, normal, _, _ = simulate_sensitive(problem, i, values, motions[i], horizon)
+    simulated = side_by_side(
+        lambda i: simulate_sensitive(problem, i, values, motions[i], horizon),
+        range(len(problem.trials)),
+    )
+    for i, (n, normal, _, _) in enumerate(simulated):
         m2 = len(motions[i])
         # Sensitivities can run away before the motion does.
         if normal.rows < n or not np.abs(normal.hessian).max() < RUNAWAY:
@@ -264,7 +268,7 @@ def simulate_sensitive(
     Columns: what the trial has of its own, then the shared values (not coordinates).
     """
     trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
-    p = problem.vectors[i]
+    p = problem.vectors[i].copy()
     p[problem.places[i]] = values
     m2 = len(motion) - len(problem.own)
     p[problem.own_places[i]] = own_values(problem.own, motion)

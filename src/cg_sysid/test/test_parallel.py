@@ -1,0 +1,69 @@
+"""One piece of work alone has all cores; what it comes to is the same to the bit."""
+
+import math
+import threading
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.identify import fit
+from cg_sysid.parallel import run_all, side_by_side
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+
+
+def _meet(count):
+    """True for each of `count` calls that are under way at the same time."""
+    together = threading.Barrier(count)
+
+    def wait(_):
+        try:
+            return together.wait(timeout=5.0) >= 0
+        except threading.BrokenBarrierError:
+            return False
+
+    return list(side_by_side(wait, range(count)))
+
+
+def test_one_piece_alone_has_all_cores():
+    before = threading.active_count()
+    assert run_all(_meet, [(2,)], workers=2) == [[True, True]]
+    assert threading.active_count() == before
+
+
+def test_results_come_in_order_and_errors_through():
+    assert run_all(_squares, [([3, 1, 2],)], workers=2) == [[9, 1, 4]]
+    assert list(side_by_side(abs, [-3, -1])) == [3, 1]
+    with pytest.raises(ValueError, match=r'math domain|nonnegative'):
+        run_all(_roots, [([4.0, -1.0],)], workers=2)
+
+
+def _squares(items):
+    return list(side_by_side(lambda x: x * x, items))
+
+
+def _roots(items):
+    return list(side_by_side(math.sqrt, items))
+
+
+def test_a_fit_in_threads_is_the_same_to_the_bit(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_values({'c1': 1.06 * nominal.values['c1']})
+    records = [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.1 * t) * t)],
+            4.0, 0.004, k,
+        )
+        for k in range(3)
+    ]  # fmt: skip
+    trials = prepare(nominal, records)
+    (beside,) = run_all(fit, [(nominal, trials)], workers=2)
+    alone = fit(nominal, trials)
+    assert beside.evaluations == alone.evaluations
+    np.testing.assert_array_equal(beside.values, alone.values)
+    np.testing.assert_array_equal(beside.covariance, alone.covariance)
