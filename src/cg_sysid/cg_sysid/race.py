@@ -102,23 +102,23 @@ class Race:
         found: dict[str, Outcome] = {}
         if events and _nothing_helps(base, looks) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
-        reach = NEAR * min(_best(found), _smallest(looks), beaten)
+        # What is on top of a base has to come below it.
+        reach = min(NEAR * min(_best(found), _smallest(looks), beaten), _error(base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (FAVOURED * _smallest(looks), np.inf):
-            reach = _reach(min(_best(found), beaten))
+            reach = min(_reach(min(_best(found), beaten)), _error(base.base))
             heat = [look for look in _worth_more(looks, reach, base.first)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
             tried.update(look.label for look in heat)
             found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
         # To seek events in every record takes long: first what explains most of the error.
-        most = base.base.normalised_error / MOST if base.base else 0.0
-        if _best(found) > max(NOTHING_LEFT, most):
+        if base.base is None or _best(found) > max(NOTHING_LEFT, _error(base.base) / MOST):
             found |= self._fitted(events, f'{what}, events')
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
-            going = _may_still_win(found, gained, beaten)
+            going = _may_still_win(found, gained, min(beaten, _error(base.base)))
             again = self._fitted(
                 [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
@@ -128,7 +128,7 @@ class Race:
         return list(found.values()), [look.label for look in looks if look.label not in tried]
 
     def lead_deeper(self, base: Task, effects: Effects, what: str) -> Fit | None:
-        """Where the base's own numbers come to in the first seconds with one effect more.
+        """Where the base's own numbers come to in the first seconds, with one effect more or none.
 
         An effect more may be no more than a way out of a local minimum of the base: play has
         many, and whatever is put on top of it would seem to help.
@@ -139,10 +139,12 @@ class Race:
             what: For the progress.
 
         Returns:
-            A fit of the base alone that lies deeper than its own, if there is one.
+            A fit of the base alone to go on from, if one lies deeper than its own.
         """
         if base.first is None:
             return None
+        if _error(base.first) < SETTLED < _error(base.base):
+            return base.first
         light = _light(_on_top(base, effects))
         found: list[Fit] = []
         # Many lead the same way: the first few may do.
@@ -204,6 +206,10 @@ def _known(look: Look) -> float:
     return look.error if np.isfinite(look.error) else np.inf
 
 
+def _error(found: Fit | None) -> float:
+    return np.inf if found is None else found.normalised_error
+
+
 def _smallest(looks: Iterable[Look]) -> float:
     return min(map(_known, looks), default=np.inf)
 
@@ -234,8 +240,8 @@ def _worth_more(looks: Sequence[Look], reach: float, first: Fit | None) -> list[
     if not errors:
         return list(looks)
     reach = min(reach, IN_REACH * errors[0])
-    if first is not None and errors[0] < first.normalised_error / MOST:
-        reach = min(reach, IDLE * first.normalised_error)
+    if errors[0] < _error(first) / MOST:
+        reach = min(reach, IDLE * _error(first))
     limit = max(reach, errors[min(FEWEST, len(errors)) - 1])
     return [look for look in looks if not look.error > limit]
 
@@ -245,9 +251,12 @@ def _may_still_win(
 ) -> list[Outcome]:
     """Unfinished fits that are near the best, and do not come nearer too slowly."""
     best = min(map(chi2, found.values()), default=0.0)
+    # Where the noise is reached, what did not come below its base in eight iterations will not.
+    limit = beaten / SAME if _best(found) < NOTHING_LEFT else np.inf
     going = [
         o for label, o in found.items()
         if not o.train.converged and chi2(o) < IN_REACH * min(best, beaten * samples(o))
+        and o.train.normalised_error < limit
         and (label not in gained or chi2(o) - best <= HOPE * gained[label])
     ]  # fmt: skip
     # Where nobody else is after it the best has won.

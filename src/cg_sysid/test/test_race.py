@@ -124,3 +124,25 @@ def test_an_event_is_sought_before_all_others_are_fitted(nominal):
     assert best.label == 'external_push'
     assert best.held.normalised_error == pytest.approx(1.0, abs=0.05)
     assert done.index('events') == min(k for k, w in enumerate(done) if w in ('events', 'race'))
+
+
+def test_a_base_is_led_out_of_a_local_minimum(nominal):
+    """As play has many, what is put on top of it would seem to help."""
+    train = _trials(nominal, _machine(nominal, ('torque_constant', {'error': 0.1})))
+    model = nominal.with_effect('torque_constant')
+    alone = Task(model, base=fit(model, train))
+    alone = replace(alone, first=first_seconds(alone, train))
+    stuck = replace(alone.first, mse=4 * alone.first.mse)
+    effects = [('payload', None), ('torque_bias', None)]
+    race = Race(train, train, _one_after_the_other)
+    assert race.lead_deeper(alone, effects, 'a fit at its minimum') is None
+    lead = race.lead_deeper(replace(alone, first=stuck), effects, 'a fit that is stuck')
+    assert lead.normalised_error == pytest.approx(alone.first.normalised_error, rel=0.01)
+    assert [u.name for u in lead.unknowns] == [u.name for u in alone.first.unknowns]
+    # The first seconds fit, all of the record does not: from there it is tried again.
+    lost = replace(alone, base=replace(alone.base, mse=4 * alone.base.mse))
+    assert race.lead_deeper(lost, effects, 'a fit that got lost') is alone.first
+
+
+def _one_after_the_other(function, arguments, what):
+    return [function(*a) for a in arguments]
