@@ -49,7 +49,7 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.imperfections import imperfect, with_imperfections
-from cg_sysid.jury import EARNED, MATERIAL, Contest, Jury, at_noise, settled
+from cg_sysid.jury import COARSE_FIDELITY, EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
@@ -303,11 +303,11 @@ class _Search:
 
     def _tie(self, contest: Contest, label: str) -> Contest | None:
         """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
-        close = [label, *(c.label for c in contest.close_to(label))]
-        ties = [contest.of(name) for name in close]
-        if len(close) == 1 or not all(at_noise(pair[1]) for pair in ties if pair):
+        close = [label, *(c.label for c in contest.close_to(label, COARSE_FIDELITY))]
+        ties = [pair[1] for name in close if (pair := contest.of(name)) and at_noise(pair[1])]
+        if len(ties) < 2 or ties[0].label != label:
             return None
-        outcomes = [self._thorough(pair[1]) for pair in ties if pair]
+        outcomes = [self._thorough(o) for o in ties]
         return self.jury.contest(contest.base, outcomes, thorough=True)
 
     def _ties_settled(self, nominal: Outcome, final: Outcome) -> Outcome:

@@ -25,6 +25,9 @@ from cg_sysid.trial import Trial
 FIDELITY = 1.5e-3
 # The same for thorough fits, whose late torques change at their own instants.
 THOROUGH_FIDELITY = 2e-4
+# Those that may be rivals and are fitted thoroughly: a late torque that changes between rows, and
+# readings that are late instead, differ by so much before.
+COARSE_FIDELITY = 2e-2
 # A model that leaves more than white noise has something wrong, and small differences say less.
 ROUGH_FIDELITY = 2e-3
 WHITE = 0.9  # share of independent samples from which a residual counts as white noise
@@ -74,12 +77,17 @@ class Contest:
         """The candidate of that label."""
         return next((pair for pair in self.ranked if pair[0].label == label), None)
 
-    def close_to(self, label: str) -> list[Candidate]:
-        """Other earned candidates that come within the margin of this one, best first."""
+    def close_to(self, label: str, fidelity: float = 0.0) -> list[Candidate]:
+        """Other earned candidates that come within the margin of this one, best first.
+
+        Args:
+            label: Of this one.
+            fidelity: Share of chi2/N by which they may differ besides.
+        """
         found = self.of(label)
         if found is None:
             return []
-        least = found[0].evidence - self.margin
+        least = found[0].evidence - max(self.margin, fidelity * self.independent / 2)
         return [
             c for c, _ in self.ranked if c.label != label and not c.reason and c.evidence > least
         ]
