@@ -632,9 +632,16 @@ def _outstanding(o: Outcome) -> list[str]:
 
 def _as_in(final: Outcome, cause: Cause) -> Cause:
     """The cause with the values of another fit."""
+    prefix = f'{cause.label}.'
     return replace(
-        cause, parameters=parameters_of(final, cause.label), events=events_of(final, cause.label)
-    )
+        cause,
+        parameters=parameters_of(final, cause.label),
+        events=events_of(final, cause.label),
+        undetermined=tuple(
+            name.removeprefix(prefix) for name in final.train.undetermined
+            if name.startswith(prefix)
+        ),
+    )  # fmt: skip
 
 
 def _cause(final: Outcome, label: str, contest: Contest) -> Cause:

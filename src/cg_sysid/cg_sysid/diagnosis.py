@@ -102,6 +102,7 @@ class Cause:
         rivals: Other effects that explain the records as well.
         places: Labels of the same effect at other places that explain the records as well.
         proposals: Experiments that would tell it from its rivals, best first.
+        undetermined: Parameters of which the records do not even tell the order.
         events: What happened in single records: record -> parameter -> (value, standard
             deviation, unit).
     """
@@ -113,6 +114,7 @@ class Cause:
     places: tuple[str, ...] = ()
     events: Mapping[str, Mapping[str, tuple[float, float, str]]] = field(default_factory=dict)
     proposals: tuple[Proposal, ...] = ()
+    undetermined: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,12 @@ def summary_of(
             f'The simulation lacks {named}; with it the held-out error of {biggest.channel} '
             f'falls from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
             f'(noise {biggest.noise:.2g}).'
+        )
+    vague = [f'{c.label}.{name}' for c in causes for name in c.undetermined]
+    if vague:
+        text += (
+            f' These records do not determine {" and ".join(vague)}: what acts like this need '
+            'not be what it is named after.'
         )
     best = next((c.proposals[0] for c in causes if c.proposals), None)
     if best is not None and best.evidence > MARGIN:

@@ -40,6 +40,7 @@ ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may 
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
+ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 HOPE = 10.0  # times that gain, within which it may still come there
 
 
@@ -107,6 +108,15 @@ class Fit:
         pairs = zip(self.unknowns, self.values, strict=True)
         factor = [v if u.logarithmic else 1.0 for u, v in pairs]
         return spread * np.array(factor)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Positive numbers without a belief of which not even the order is known."""
+        relative = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+        return tuple(
+            u.name for u, spread in zip(self.unknowns, relative, strict=True)
+            if u.logarithmic and not np.isfinite(u.tolerance) and spread > ORDER
+        )
 
     def own_by_name(self, trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
         """What was found of each trial alone: its name -> full name -> value."""
@@ -418,6 +428,11 @@ def _warnings(fit: Fit, bounds: Collection[str]):
             yield f'{u.name} = {value:.4g} {u.unit} lies at the edge of its range'
         if not np.isfinite(sigma):
             yield f'{u.name} cannot be identified from these records'
+        elif u.name in fit.undetermined:
+            yield (
+                f'{u.name} = {value:.2g} +- {sigma:.2g} {u.unit} is not determined by these '
+                'records: what acts like this need not be what it is named after'
+            )
         elif share < 0.2 and np.isfinite(u.tolerance):
             yield (
                 f'{u.name} is hardly seen by these records: its value is mostly what the '

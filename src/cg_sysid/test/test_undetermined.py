@@ -1,0 +1,52 @@
+"""What records do not tell is said, by the fit and in the summary."""
+
+import math
+
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.diagnosis import Cause, Gain, summary_of
+from cg_sysid.identify import fit
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+SOFT = {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.6}
+
+
+@pytest.fixture(scope='module')
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+def _fit_of_a_flexible_joint(nominal, machine):
+    record = rehearse(
+        'record', machine, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
+        [lambda t: 9.0 * math.sin(2 * math.pi * (0.5 + 0.4 * t) * t)], 6.0, 0.004, 3,
+    )  # fmt: skip
+    model = nominal.with_effect('joint_flexibility', **SOFT)
+    return fit(model, prepare(nominal, [record]))
+
+
+def test_a_spring_that_is_there_is_determined(nominal):
+    found = _fit_of_a_flexible_joint(nominal, nominal.with_effect('joint_flexibility', **SOFT))
+    assert found.undetermined == ()
+    assert not any('not determined' in warning for warning in found.warnings)
+
+
+def test_a_spring_that_acts_like_a_lag_is_not(nominal):
+    found = _fit_of_a_flexible_joint(nominal, nominal.with_effect('actuator_lag', time_constant=0.01))
+    assert found.undetermined
+    assert all(name.startswith('joint_flexibility.') for name in found.undetermined)
+    told = [warning for warning in found.warnings if 'not determined' in warning]
+    assert [warning.split(' = ')[0] for warning in told] == list(found.undetermined)
+
+
+def test_the_summary_says_so():
+    cause = Cause('joint_flexibility', {'stiffness': (0.44, 0.57, 'N m/rad')}, 900.0,
+                  undetermined=('stiffness',))  # fmt: skip
+    gain = Gain('hip_angle', 'rad', 1e-4, 0.02, 0.001)
+    assert 'do not determine joint_flexibility.stiffness' in summary_of(
+        'explained', [cause], (gain,), {}
+    )
