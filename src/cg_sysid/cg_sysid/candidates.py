@@ -13,7 +13,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.events import seek_events, undisturbed
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
-from cg_sysid.imperfections import Bounds, turning
+from cg_sysid.imperfections import SMOOTHING, Bounds, turning
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
@@ -164,8 +164,10 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
 
 def _unbound(task: Task) -> Task:
     """A small fault that is tried as a cause is no longer bound to be small."""
-    label = _label(task)
-    bounds = {n: b for n, b in task.bounds.items() if not n.startswith(f'{label}.')}
+    bounds = {
+        n: b for n, b in task.bounds.items()
+        if n.endswith(SMOOTHING[0]) or not n.startswith(f'{_label(task)}.')
+    }  # fmt: skip
     return replace(task, bounds=bounds)
 
 
@@ -315,9 +317,14 @@ def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
 
 def one_minimum(a: Fit, b: Fit, label: str) -> bool:
     """Whether two fits of an effect ended alike, or will."""
-    own = [u.name.startswith(f'{label}.') for u in a.unknowns]
+    own, other = (
+        {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)
+         if u.name.startswith(f'{label}.')}
+        for found in (a, b)
+    )  # fmt: skip
     near = a.normalised_error < SAME * b.normalised_error
-    return near and np.allclose(a.values[own], b.values[own], rtol=ALIKE)
+    alike = np.allclose(list(own.values()), [other.get(n, np.nan) for n in own], rtol=ALIKE)
+    return near and bool(alike)
 
 
 def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:

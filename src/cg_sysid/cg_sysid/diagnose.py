@@ -154,7 +154,7 @@ def diagnose(
     if landings is None:
         cut = cut_steps(records, model)
         records, landings = cut.records, cut.landings
-    trials = [_led_in(trial) for trial in prepare(model, records)]
+    trials = [led_in(trial) for trial in prepare(model, records)]
     train, held = split(trials, options.held)
 
     def answer(train: Sequence[Trial], held: Sequence[Trial]) -> Diagnosis:
@@ -181,7 +181,7 @@ def diagnose(
     return again if better else found
 
 
-def _led_in(trial: Trial) -> Trial:
+def led_in(trial: Trial) -> Trial:
     """The trial less the outputs of its first moments.
 
     What went before a record is an assumption of every model with a memory, as a delay; it must
@@ -220,7 +220,8 @@ class _Search:
             if self._added(final) in seen:
                 break
             seen.add(self._added(final))
-        return self._conclude(base, self._ties_settled(base, self._less_small_faults(final)))
+        final = self._ties_settled(base, self._less_small_faults(final))
+        return self._conclude(base, self._less_small_faults(final))
 
     def _added(self, o: Outcome) -> frozenset[str]:
         """Labels of the effects that were put on top of the nominal model, less small faults."""
@@ -311,16 +312,24 @@ class _Search:
         return self.jury.contest(contest.base, outcomes, thorough=True)
 
     def _ties_settled(self, nominal: Outcome, final: Outcome) -> Outcome:
-        """The structure with those effects that win over their rivals in thorough fits."""
+        """The structure with those effects that win over their rivals in thorough fits.
+
+        Of several that do as well, the one that needs the fewest small faults beside it.
+        """
         for label in sorted(self._added(final)):
             contest = self._without(nominal, final, label)
             tie = contest and self._tie(contest, label)
-            if not tie:
+            own, winner = (tie.of(label), tie.winner()) if tie else (None, None)
+            if not (tie and own and winner):
                 continue
-            own, winner = tie.of(label), tie.winner()
-            if own and winner and winner[0].evidence > own[0].evidence + tie.margin:
-                # Evidence only grows: this comes to an end.
-                return self._ties_settled(nominal, winner[1])
+            level = [
+                o for c, o in tie.ranked
+                if not c.reason and c.evidence > winner[0].evidence - tie.margin
+            ]
+            best = min(level, key=lambda o: len(_shown(o)))
+            beaten = own[0].evidence < winner[0].evidence - tie.margin
+            if beaten or len(_shown(best)) < len(_shown(own[1])):
+                final = best
         return final
 
     def _with_small_faults(self, o: Outcome) -> Outcome:

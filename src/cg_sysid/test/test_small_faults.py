@@ -7,11 +7,14 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.candidates import Task, look_at, one_minimum
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.experiments import load_experiment
+from cg_sysid.identify import fit
 from cg_sysid.imperfections import SOUND, imperfect, with_imperfections
 from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
 
 EFFECTS = (
     'torque_bias', 'encoder_offset', 'actuator_delay', 'actuator_lag', 'quadratic_friction',
@@ -123,3 +126,19 @@ def test_small_faults_stay_within_their_bounds(nominal):
     # What the file itself states is no small fault.
     stated = nominal.with_effect('encoder_offset', offset=0.01)
     assert 'encoder_offset' not in imperfect(*with_imperfections(stated, [_springs(200.0)]))
+
+
+def test_other_starts_of_a_cause_have_the_unknowns_of_its_fit(nominal):
+    """A friction with a smoothing of its own, which is a small fault even where it is a cause."""
+    machine = nominal.with_effect('asymmetric_friction', excess=0.3)
+    trials = prepare(nominal, _records(machine)[:2])
+    effect = ('asymmetric_friction', None)
+    model, bounds = with_imperfections(nominal.with_effect(*effect), [_springs(200.0)])
+    assert 'asymmetric_friction.transition_rate' in bounds
+    whole = fit(model, trials, bounds=bounds, iterations=2)
+    task = Task(model.without_effect(effect[0]), effect, bounds=bounds)
+    lead = look_at(task, trials).task.leads[0]
+    assert {u.name for u in lead.unknowns} == {u.name for u in whole.unknowns}
+    assert one_minimum(whole, whole, effect[0])
+    # Fits of other structures are compared too, and are not one minimum.
+    assert not one_minimum(whole, fit(nominal, trials, iterations=2), effect[0])

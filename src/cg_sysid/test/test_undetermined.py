@@ -36,7 +36,8 @@ def test_a_spring_that_is_there_is_determined(nominal):
 
 
 def test_a_spring_that_acts_like_a_lag_is_not(nominal):
-    found = _fit_of_a_flexible_joint(nominal, nominal.with_effect('actuator_lag', time_constant=0.01))
+    late = nominal.with_effect('actuator_lag', time_constant=0.01)
+    found = _fit_of_a_flexible_joint(nominal, late)
     assert found.undetermined
     assert all(name.startswith('joint_flexibility.') for name in found.undetermined)
     told = [warning for warning in found.warnings if 'not determined' in warning]
