@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
 IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
 NEAR = 3.0  # the same where that error is the noise
+AS_GOOD = 1.2  # times what is to be beaten, from which a candidate does not come up to it
 HOPE = 10.0  # times what the last rung gained, from which it may still win
 NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
 FAVOURED = 2.0  # times the best look's error, up to which a candidate is fitted first
@@ -89,7 +90,7 @@ class Race:
             base: The task of the base, with its fits.
             effects: Effects and places.
             what: For the progress.
-            beaten: chi2/N that is to be beaten.
+            beaten: chi2/N that is to be beaten, or nearly so.
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
@@ -103,18 +104,21 @@ class Race:
         if events and _nothing_helps(base, looks) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
-        reach = min(NEAR * min(_best(found), _smallest(looks), beaten), _error(base.first))
+        known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
+        reach = min(known, _error(base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (FAVOURED * _smallest(looks), np.inf):
-            reach = min(_reach(min(_best(found), beaten)), _error(base.base))
-            heat = [look for look in _worth_more(looks, reach, base.first)
+            reach = min(_reach(_best(found)), AS_GOOD * beaten, _error(base.base))
+            fewest = FEWEST if np.isinf(beaten) else 0
+            heat = [look for look in _worth_more(looks, reach, base.first, fewest)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
             tried.update(look.label for look in heat)
             found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
         # To seek events in every record takes long: first what explains most of the error.
-        if base.base is None or _best(found) > max(NOTHING_LEFT, _error(base.base) / MOST):
+        best = min(_best(found), beaten)
+        if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
             found |= self._fitted(events, f'{what}, events')
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
@@ -230,7 +234,9 @@ def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
     return base.first.normalised_error < MUCH or _smallest(looks) > MUCH
 
 
-def _worth_more(looks: Sequence[Look], reach: float, first: Fit | None) -> list[Look]:
+def _worth_more(
+    looks: Sequence[Look], reach: float, first: Fit | None, fewest: int
+) -> list[Look]:
     """Looks within reach of the best, and those that cannot tell.
 
     Where something explains most of the base's error in the first seconds, what explains nothing
@@ -242,7 +248,7 @@ def _worth_more(looks: Sequence[Look], reach: float, first: Fit | None) -> list[
     reach = min(reach, IN_REACH * errors[0])
     if errors[0] < _error(first) / MOST:
         reach = min(reach, IDLE * _error(first))
-    limit = max(reach, errors[min(FEWEST, len(errors)) - 1])
+    limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
     return [look for look in looks if not look.error > limit]
 
 
