@@ -223,6 +223,7 @@ def _cause(cause: Cause, model: Model) -> Facts:
     return {
         **_effect(cause.label),
         'parameters': _values(cause.parameters, cause.label, ranges),
+        'undetermined': list(cause.undetermined),
         'evidence_nats': cause.evidence,
         'rivals': [_effect(rival) for rival in cause.rivals],
         'places': list(cause.places),

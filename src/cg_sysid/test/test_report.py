@@ -75,6 +75,14 @@ def test_every_verdict_is_drawn(facts, lines, verdict):
     assert len(page) < 3_000_000
 
 
+def test_what_is_not_determined_is_said_beside_the_cause(facts, lines):
+    said = 'These recordings do not determine bias: what acts like this'
+    assert said not in render(facts, lines)
+    made = with_verdict(facts, 'explained')
+    made['causes'][0]['undetermined'] = ['bias']
+    assert said in render(made, lines)
+
+
 def test_the_page_fetches_nothing(facts, lines):
     page = render(facts, lines)
     parser = outline(page)

@@ -13,6 +13,7 @@ from cg_sysid.report.wording import (
     lead,
     left_words,
     parameter_words,
+    undetermined_words,
 )
 from cg_sysid.text import effect_name, listed, number, scaled, sentence
 
@@ -68,6 +69,7 @@ def _cause(cause: Facts) -> Markup:
         tag('h3', sentence(effect_name(cause['name'])), where),
         [tag('p', words, class_='big') for words in parameter_words(cause['parameters'])],
         [tag('p', words, class_='soft') for words in event_words(cause)],
+        [tag('p', f'{sentence(words)}.', class_='doubt') for words in undetermined_words(cause)],
         tag('p', cause['description'], class_='soft'),
         tag('p', f'{proof}{PLACES.get(cause["place"], "")}.', class_='soft small'),
         [tag('div', tag('b', 'Could also be ', effect_name(r['label'])),
@@ -87,7 +89,8 @@ def _next_experiment(cause: Facts) -> Markup | None:
         return None
     best = cause['next_experiments'][0]
     if best['expected_nats'] < WORTH_NATS:
-        return tag('p', 'No experiment that can be launched would tell them apart.', class_='soft')
+        words = 'No experiment that can be launched would tell them apart.'
+        return tag('p', words, class_='soft next')
     torque = best['excitation']
     fastest = f' up to {number(torque["f_max"])} Hz' if 'f_max' in torque else ''
     return tag('p',
@@ -95,6 +98,7 @@ def _next_experiment(cause: Facts) -> Markup | None:
         f' ({torque["kind"]}{fastest}, {number(best["duration_s"])} s) would tell ',
         listed([effect_name(name) for name in best['tells_apart']], 'and'),
         f' apart with about {number(best["expected_nats"])} nats.',
+        class_='next',
     )  # fmt: skip
 
 

@@ -164,6 +164,17 @@ def event_words(cause: Facts) -> list[str]:
     return [*found[:MOST_EVENTS], f'and {more} more in diagnosis.json'] if more > 0 else found
 
 
+def undetermined_words(cause: Facts) -> list[str]:
+    """That the records do not determine some of its parameters, in at most one sentence."""
+    names = [name.replace('_', ' ') for name in cause.get('undetermined', ())]
+    if not names:
+        return []
+    return [
+        f'these recordings do not determine {" and ".join(names)}: what acts like this need not '
+        'be what it is named after'
+    ]
+
+
 def parameter_words(parameters: Facts) -> list[str]:
     """`delay 8.01 ± 0.05 ms`, one for each parameter."""
     return [
