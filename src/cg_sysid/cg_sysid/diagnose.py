@@ -539,6 +539,17 @@ class _Search:
         """Those of them that are above the noise."""
         return {c: v for c, v in self._remaining(o).items() if v > (1 + MATERIAL) ** 2}
 
+    def _own_judges(self) -> list[str]:
+        """That recordings were judged by pieces of themselves, in words."""
+        fitted = {trial.recording for trial in self.train}
+        judges = {trial.recording for trial in self.held}
+        if judges - fitted:
+            return []
+        return [
+            f'what was found in {", ".join(sorted(judges))} was judged on other pieces of the '
+            'same recordings, which share their mishaps: record again before you believe it'
+        ]
+
     def _small_faults(self, final: Outcome) -> list[str]:
         """What is there of small faults and what else would explain them, in words."""
         found = _small_faults(final)
@@ -579,7 +590,10 @@ class _Search:
             train=tuple(self.train),
             held=tuple(self.held),
             remaining=self._remaining(final),
-            findings=(*self._small_faults(final), *_outstanding(final), *final.train.warnings),
+            findings=(
+                *self._small_faults(final), *_outstanding(final),
+                *(self._own_judges() if causes else ()), *final.train.warnings,
+            ),
             unmodelled=unmodelled,
         )  # fmt: skip
 

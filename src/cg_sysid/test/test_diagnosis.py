@@ -1,5 +1,7 @@
 """The answer in words."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from cg_dynamics.model import Model
@@ -34,6 +36,22 @@ def test_a_record_that_holds_most_of_the_error_is_a_finding(model_file):
     assert told[0].startswith('swing 3 holds')
     sound = diagnose(nominal, records[:3] + records[4:], options)
     assert not any('holds' in f for f in sound.findings)
+
+
+def test_a_recording_that_judges_itself_is_a_finding(model_file):
+    nominal = Model.load(model_file)
+    pulled = nominal.with_effect('torque_bias', bias=0.6)
+    records = [
+        rehearse(f'swing {k}', pulled, Setup('inner', 'inner_fixed'), [0.1 * k, 0.5],
+                 [lambda t, k=k: 4.0 * np.sin((3 + k) * t)], 2.0, 0.002, k)
+        for k in range(4)
+    ]  # fmt: skip
+    options = Options(effects=('torque_bias',), workers=0)
+    windows = [replace(record, source='swing') for record in records]
+    for given, told in ((records, 0), (windows, 1)):
+        found = diagnose(nominal, given, options)
+        assert found.causes
+        assert sum('of the same recordings' in f for f in found.findings) == told
 
 
 def test_a_simpler_effect_is_contained_at_the_same_place_only():
