@@ -465,7 +465,8 @@ def chi2(o: Outcome) -> float:
 def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
     """Identified parameters of one effect: name -> (value, standard deviation, unit).
 
-    Of what every record has of its own, that of the record where it is surest.
+    Of what every record has of its own, that of the record where it is surest: of those that were
+    fitted, if it happened in one, as held-out records take the model's own numbers for certain.
     """
     prefix = f'{label}.'
     shared = {
@@ -473,7 +474,9 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
         for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
         if u.name.startswith(prefix)
     }
-    surest = max(events_of(o, label).values(), key=_sureness, default={})
+    events = events_of(o, label)
+    fitted = [events[name] for name in o.trials[0] if name in events]
+    surest = max(fitted or events.values(), key=_sureness, default={})
     return {**surest, **shared}
 
 
