@@ -46,22 +46,17 @@ def exact_sensors(machine):
 
 def structures(nominal, hidden, rival):
     """Tasks with the rival in place of one of the hidden effects, at each place and at all."""
-    places = [effect.at for effect in sites_of(nominal, rival)]
+    places = LIBRARY[rival].sites(nominal.mechanism)
     for gone in hidden:
         base = nominal
         for name in hidden:
             base = base.with_effect(name, None) if name != gone else base
         for at in places:
-            rest = [p for p in places if p != at]
             yield Task(base, (rival, at))
-            if rest:
-                for p in rest:
-                    base = base.with_effect(rival, p)
-                yield Task(base, (rival, at))
-
-
-def sites_of(model, name):
-    return [LIBRARY[name](model.mechanism, at) for at in LIBRARY[name].sites(model.mechanism)]
+        for at in places[1:]:
+            base = base.with_effect(rival, at)
+        if places[1:]:
+            yield Task(base, (rival, places[0]))
 
 
 def least(tasks, train, held, workers):

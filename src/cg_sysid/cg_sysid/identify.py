@@ -40,8 +40,8 @@ ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may 
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
-ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 HOPE = 10.0  # times that gain, within which it may still come there
+ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 
 
 @dataclass(frozen=True)
