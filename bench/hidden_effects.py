@@ -51,6 +51,7 @@ SECONDS = 8.0
 # To torques late and all readings late by one time only the first moments of a record differ.
 THE_SAME = ({'actuator_delay', 'sensor_delay'},)
 UNTOLD = 9.5  # nats: what differs by less, all records together, is not told apart
+SPRING_ERROR = 0.01  # relative, of all springs, among small faults
 SHARE = 3.0  # of the noise: causes that explain less are not counted as hidden
 
 
@@ -110,7 +111,7 @@ def case(effects, size, seed, faults, workers=None):
     )
     if faults:
         machine = with_small_faults(machine)
-    records = records_of(machine, seed, 0.01 if faults else 0.0)
+    records = records_of(machine, seed, SPRING_ERROR * faults)
     about = {'size': size, 'seed': seed, 'faults': faults}
     return about | row_of(nominal, records, values, workers)
 

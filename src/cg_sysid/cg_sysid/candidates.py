@@ -19,6 +19,7 @@ from cg_sysid.unknowns import IdentificationError, own_unknowns
 
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
+THOROUGH_ITERATIONS = 72  # of the last fit
 SCREENS_S = (2.0, 5.0)  # lengths of the first look: the first of them in which the base fails
 MOST_STARTS = 24
 FOLLOWED = 3  # starts that are worth a second look
@@ -198,17 +199,30 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
-    belief = sum(
-        ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
-        for u, v in zip(best.unknowns, best.values, strict=True)
-        if np.isfinite(u.tolerance)
-    )
     return Outcome(
-        task, label, model, best, held_score, residuals, belief,
+        task, label, model, best, held_score, residuals, best.belief,
         # Small faults cost nothing: every robot has them.
         len(best.unknowns) - len(task.bounds) + _own_count(best, (*train, *held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),
     )  # fmt: skip
+
+
+def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
+    """A thorough fit of an outcome's structure to all records, those held out among them.
+
+    Rivals that have earned their place on held-out records are told apart by this: values that
+    were fitted to one half miss the other by chance, and by more than rivals may differ.
+
+    Args:
+        o: The outcome to go on from.
+        trials: Those of its training, then those held out.
+    """
+    start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    try:
+        return fit(o.model, trials, start=start, own=o.events, bounds=o.task.bounds, thorough=True,
+                   iterations=THOROUGH_ITERATIONS)  # fmt: skip
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
 
 
 def _own_count(found: Fit, trials: Sequence[Trial]) -> int:
@@ -459,7 +473,7 @@ def believing(fitted: Model, base: Model, label: str) -> Model:
 
 def chi2(o: Outcome) -> float:
     """Squared error over noise variance, training and held-out trials together."""
-    return float((o.train.mse * o.train.count).sum() + (o.held.mse * o.held.count).sum())
+    return o.train.squares + o.held.squares
 
 
 def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:

@@ -23,12 +23,14 @@ from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
 from cg_sysid.candidates import (
     SAME,
+    THOROUGH_ITERATIONS,
     Outcome,
     Task,
     candidates_for,
     chi2,
     events_of,
     first_seconds,
+    fit_to_all,
     one_minimum,
     parameters_of,
     started_from,
@@ -48,6 +50,7 @@ from cg_sysid.diagnosis import (
     summary_of,
 )
 from cg_sysid.held_foot import held_by_friction
+from cg_sysid.identify import Fit
 from cg_sysid.imperfections import imperfect, with_imperfections
 from cg_sysid.jury import COARSE_FIDELITY, EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
@@ -69,11 +72,11 @@ PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
-THOROUGH_ITERATIONS = 72  # of the last fit
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int], None]
+Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
 
 
 def split(
@@ -201,7 +204,8 @@ class _Search:
         self.race = Race(train, held, self.carry_out)
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
-        self.thorough: dict[tuple[frozenset[str], frozenset[str]], Outcome] = {}
+        self.thorough: dict[Structure, Outcome] = {}
+        self.joint: dict[Structure, Fit | str] = {}  # to all records
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
@@ -265,7 +269,7 @@ class _Search:
 
         Thorough fits stand in contests only among themselves, or they would have the advantage.
         """
-        key = frozenset(e.label for e in o.model.effects), frozenset(o.task.bounds)
+        key = _structure(o)
         if key not in self.thorough:
             self.thorough[key] = self._fitted_thoroughly(o)
         return replace(self.thorough[key], label=o.label)
@@ -309,7 +313,16 @@ class _Search:
         if len(ties) < 2 or ties[0].label != label:
             return None
         outcomes = [self._thorough(o) for o in ties]
-        return self.jury.contest(contest.base, outcomes, thorough=True)
+        return self.jury.contest(contest.base, outcomes, [self._fit_to_all(o) for o in outcomes])
+
+    def _fit_to_all(self, o: Outcome) -> Fit | str:
+        """A thorough fit of an outcome's structure to all records, or why there is none."""
+        key = _structure(o)
+        if key not in self.joint:
+            title = f'{self._title(self._added(o))} on all records'
+            found = self.carry_out(fit_to_all, [(o, (*self.train, *self.held))], title)[0]
+            self.joint[key] = found
+        return self.joint[key]
 
     def _ties_settled(self, nominal: Outcome, final: Outcome) -> Outcome:
         """The structure with those effects that win over their rivals in thorough fits.
@@ -596,6 +609,10 @@ class _Search:
             ),
             unmodelled=unmodelled,
         )  # fmt: skip
+
+
+def _structure(o: Outcome) -> Structure:
+    return frozenset(e.label for e in o.model.effects), frozenset(o.task.bounds)
 
 
 def _shown(o: Outcome) -> tuple[str, ...]:

@@ -131,6 +131,20 @@ class Fit:
         }
 
     @property
+    def squares(self) -> float:
+        """Squared error over noise variance, all trials and outputs together."""
+        return float((self.mse * self.count).sum())
+
+    @property
+    def belief(self) -> float:
+        """Squared distance from what the model file believes, in its standard deviations."""
+        return sum(
+            ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
+            for u, v in zip(self.unknowns, self.values, strict=True)
+            if np.isfinite(u.tolerance)
+        )
+
+    @property
     def normalised_error(self) -> float:
         """Mean squared error over noise variance, all trials and outputs together."""
         return float(np.nansum(self.mse * self.count) / self.count.sum())

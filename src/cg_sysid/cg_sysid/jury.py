@@ -18,6 +18,7 @@ from cg_sysid.candidates import (
 )
 from cg_sysid.diagnosis import MARGIN, Candidate, contains, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
+from cg_sysid.identify import Fit
 from cg_sysid.trial import Trial
 
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
@@ -105,21 +106,36 @@ class Jury:
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
     def contest(
-        self, base: Outcome, outcomes: Sequence[Outcome], thorough: bool = False
+        self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | str] = ()
     ) -> Contest:
-        """Rank outcomes that extend a base; `thorough` says that all their fits are."""
+        """Rank outcomes that extend a base.
+
+        Args:
+            base: What they extend.
+            outcomes: To be ranked.
+            to_all: Where all outcomes are thorough fits: of each the fit to all records, or why
+                there is none. If all went through they rank the outcomes.
+        """
         if not outcomes:
             return Contest(base, (), 2.0, MARGIN)
         leader = min([base, *outcomes], key=chi2)
         independent = independent_samples(leader.residuals, self.steps)
         reference = _evidence(base, independent)
+        joint = [f for f in to_all if isinstance(f, Fit)]
+        if len(joint) < len(outcomes):
+            found = [_evidence(o, independent) for o in outcomes]
+        else:
+            found = [
+                evidence(f.squares, samples(o), independent, o.unknowns, f.belief)
+                for f, o in zip(joint, outcomes, strict=True)
+            ]
         ranked = [
-            (self.judge(base, o, reference - _evidence(o, independent), independent), o)
-            for o in outcomes
+            (self.judge(base, o, reference - own, independent), o)
+            for own, o in zip(found, outcomes, strict=True)
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
         white = independent > WHITE * samples(leader)
-        fine = THOROUGH_FIDELITY if thorough else FIDELITY
+        fine = THOROUGH_FIDELITY if to_all else FIDELITY
         fidelity = fine if white else ROUGH_FIDELITY
         margin = max(MARGIN, fidelity * independent / 2)
         if at_noise(base):

@@ -1,0 +1,82 @@
+"""Rivals that data cannot tell apart differ by chance on records held out, not in a joint fit."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.candidates import Task, fit_to_all, try_candidate
+from cg_sysid.identify import score
+from cg_sysid.imperfections import with_imperfections
+from cg_sysid.jury import Jury
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+TWINS = 'foot_compliance', 'spring_nonlinearity'  # where springs may be off a little besides
+
+
+@pytest.fixture(scope='module')
+def fitted(model_file):
+    """The jury, the nominal model's outcome, those of the twins, and all trials."""
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('foot_compliance', stiffness=5.0)
+    records = [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.1 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 4.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.1 * t) * t)],
+            4.0, 0.004, k,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    train, held = ([trial] for trial in prepare(nominal, records))
+    model, bounds = with_imperfections(nominal, [train[0].setup])
+    base = try_candidate(Task(model, bounds=bounds), train, held)
+    twins = [
+        try_candidate(Task(model, (name, None), bounds=bounds, thorough=True), train, held)
+        for name in TWINS
+    ]
+    return Jury(train, held), base, twins, [*train, *held]
+
+
+def _apart(contest):
+    one, other = (contest.of(name)[0].evidence for name in TWINS)
+    return one - other
+
+
+def test_a_joint_fit_is_at_least_as_good(fitted):
+    _, _, twins, trials = fitted
+    for outcome in twins:
+        found = fit_to_all(outcome, trials)
+        mine = outcome.train.squares + outcome.held.squares + outcome.train.belief
+        # What it gains is what values fitted to one half lose on the other, by chance.
+        gain = mine - found.squares - found.belief
+        assert -0.1 < gain < 5 * len(found.unknowns)
+
+
+def test_twins_are_level_wherever_their_fits_to_one_half_ended(fitted):
+    jury, base, (one, other), trials = fitted
+    # The half that is fitted may have led the one astray, as a wrong belief does here.
+    values = {
+        'foot_compliance.stiffness': 2.0 * one.train.model.values['foot_compliance.stiffness']
+    }
+    astray = replace(one.train, values=np.array([
+        values.get(u.name, v) for u, v in zip(one.train.unknowns, one.train.values, strict=True)
+    ]))  # fmt: skip
+    held = score(one.train.model.with_values(values), trials[1:])
+    one = replace(one, train=astray, held=held)
+    twins = [one, other]
+    assert _apart(jury.contest(base, twins)) < -10
+    joint = jury.contest(base, twins, [fit_to_all(o, trials) for o in twins])
+    assert abs(_apart(joint)) < 2
+
+
+def test_without_all_joint_fits_none_counts(fitted):
+    jury, base, twins, _ = fitted
+    much = replace(twins[0].train, mse=1e-3 * twins[0].train.mse)
+    joint = jury.contest(base, twins, [much, 'runs away'])
+    assert _apart(joint) == _apart(jury.contest(base, twins))
+    assert joint.margin <= jury.contest(base, twins).margin
