@@ -41,9 +41,9 @@ NEAR = 3.0  # the same where that error is the noise
 AS_GOOD = 1.2  # times what is to be beaten, from which a candidate does not come up to it
 HOPE = 10.0  # times what the last rung gained, from which it may still win
 NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
-FAVOURED = 2.0  # times the best look's error, up to which a candidate is fitted first
+FAVOURED = 2.0  # times what the best look leaves above the noise, to be fitted first
 MOST = 3.0  # an error that is so many times smaller is mostly explained
-IDLE = 0.7  # share of the base's error that leaves what explains next to nothing
+IDLE = 0.7  # share of what the base leaves that leaves what explains next to nothing
 MUCH = 1.5  # chi2/N of a model of which much is wrong
 HEAVY = 10  # cost from which a candidate is looked at when the others have been
 FIRST_FEW = 8  # of the light candidates, that may show that the base was in a local minimum
@@ -105,12 +105,13 @@ class Race:
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
         known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
-        reach = min(known, _error(base.first))
+        reach = min(known, _worth_having(_smallest(looks), base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
-        for limit in (FAVOURED * _smallest(looks), np.inf):
-            reach = min(_reach(_best(found)), AS_GOOD * beaten, _error(base.base))
+        for limit in (_favoured(_smallest(looks)), np.inf):
+            best = _best(found)
+            reach = min(_reach(best), AS_GOOD * beaten, _worth_having(best, base.base))
             fewest = FEWEST if np.isinf(beaten) else 0
             heat = [look for look in _worth_more(looks, reach, base.first, fewest)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
@@ -227,6 +228,21 @@ def _reach(best: float) -> float:
     return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
 
 
+def _favoured(best: float) -> float:
+    """chi2/N up to which a look is as good as one that came to `best`."""
+    return max(SAME * best, 1 + FAVOURED * (best - 1))
+
+
+def _worth_having(best: float, base: Fit | None) -> float:
+    """chi2/N that a fit on top of a base has to come to, if another came to `best`.
+
+    It has to be below the base's. Where another explains most of what the base leaves above the
+    noise, what explains next to nothing of it can wait for the next round.
+    """
+    left = _error(base) - 1
+    return 1 + (IDLE if best - 1 < left / MOST else 1.0) * left
+
+
 def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
     """Whether much is wrong that nothing explains in the first seconds."""
     if base.base is None or base.first is None or base.base.normalised_error < MUCH:
@@ -237,17 +253,11 @@ def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
 def _worth_more(
     looks: Sequence[Look], reach: float, first: Fit | None, fewest: int
 ) -> list[Look]:
-    """Looks within reach of the best, and those that cannot tell.
-
-    Where something explains most of the base's error in the first seconds, what explains nothing
-    of it can wait for the next round.
-    """
+    """Looks within reach of the best, and those that cannot tell."""
     errors = sorted(filter(np.isfinite, map(_known, looks)))
     if not errors:
         return list(looks)
-    reach = min(reach, IN_REACH * errors[0])
-    if errors[0] < _error(first) / MOST:
-        reach = min(reach, IDLE * _error(first))
+    reach = min(reach, IN_REACH * errors[0], _worth_having(errors[0], first))
     limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
     return [look for look in looks if not look.error > limit]
 
