@@ -105,13 +105,13 @@ class Race:
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
         known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
-        reach = min(known, _worth_having(_smallest(looks), base.first))
+        reach = min(known, worth_having(_smallest(looks), base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (_favoured(_smallest(looks)), np.inf):
             best = _best(found)
-            reach = min(_reach(best), AS_GOOD * beaten, _worth_having(best, base.base))
+            reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base))
             fewest = FEWEST if np.isinf(beaten) else 0
             heat = [look for look in _worth_more(looks, reach, base.first, fewest)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
@@ -233,7 +233,7 @@ def _favoured(best: float) -> float:
     return max(SAME * best, 1 + FAVOURED * (best - 1))
 
 
-def _worth_having(best: float, base: Fit | None) -> float:
+def worth_having(best: float, base: Fit | None) -> float:
     """chi2/N that a fit on top of a base has to come to, if another came to `best`.
 
     It has to be below the base's. Where another explains most of what the base leaves above the
@@ -257,7 +257,7 @@ def _worth_more(
     errors = sorted(filter(np.isfinite, map(_known, looks)))
     if not errors:
         return list(looks)
-    reach = min(reach, IN_REACH * errors[0], _worth_having(errors[0], first))
+    reach = min(reach, IN_REACH * errors[0], worth_having(errors[0], first))
     limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
     return [look for look in looks if not look.error > limit]
 

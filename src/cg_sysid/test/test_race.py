@@ -17,7 +17,7 @@ from cg_sysid.candidates import (
 )
 from cg_sysid.events import undisturbed
 from cg_sysid.identify import fit
-from cg_sysid.race import Race
+from cg_sysid.race import IDLE, Race, worth_having
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import pieces, prepare
 
@@ -155,3 +155,11 @@ def test_a_base_is_led_out_of_a_local_minimum(nominal):
 
 def _one_after_the_other(function, arguments, what):
     return [function(*a) for a in arguments]
+
+
+def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):
+    base = fit(nominal, _trials(nominal, _machine(nominal), 2.0))
+    leaving = replace(base, mse=np.full_like(base.mse, 1.06))
+    assert worth_having(1.05, leaving) == pytest.approx(1.06)
+    assert worth_having(1.01, leaving) == pytest.approx(1 + 0.06 * IDLE)
+    assert worth_having(1.01, None) == np.inf
