@@ -11,6 +11,7 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid import glimpse
 from cg_sysid.events import seek_events, undisturbed
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import SMOOTHING, Bounds, turning
@@ -20,7 +21,6 @@ from cg_sysid.unknowns import IdentificationError, own_unknowns
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
 THOROUGH_ITERATIONS = 72  # of the last fit
-SCREENS_S = (2.0, 5.0)  # lengths of the first look: the first of them in which the base fails
 MOST_STARTS = 24
 FOLLOWED = 3  # starts that are worth a second look
 FOLLOWING = 8  # iterations of each, before the best of them is chosen
@@ -50,7 +50,7 @@ class Task:
         thorough: Fit whole records down to the very bottom (identify.fit).
         base: Fit of the base. With an effect more it can only be better; where a fit from the
             file's numbers is not, it goes on from there.
-        first: Fit of the base to the first seconds, for looks in the same way.
+        first: Fit of the base to a glimpse of the records, for looks in the same way.
         reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
     """
 
@@ -68,7 +68,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Look:
-    """A fit to the first seconds of each record: is a candidate worth a whole one?
+    """A fit to a glimpse of the records: is a candidate worth a whole one?
 
     Attributes:
         label: Label of the effect.
@@ -142,14 +142,14 @@ def starts_of(name: str) -> list[dict[str, float]]:
 
 
 def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
-    """Fit one candidate to the first seconds of the training trials, from each of its starts.
+    """Fit one candidate to a glimpse of the training trials, from each of its starts.
 
     Returns:
         The look, or a sentence saying why there is none.
     """
     label, task = _label(task), _unbound(task)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if eventful(task) or late or not _screens(train):
+    if eventful(task) or late or not glimpse.lengths(train):
         return Look(label, task, np.nan)
     try:
         leads = _first_seconds(task, train)
@@ -300,7 +300,8 @@ def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
 def _whole(
     task: Task, model: Model, train: Sequence[Trial], start: Fit | None, iterations: int
 ) -> Fit:
-    """Fit whole records."""
+    """Fit whole records, all of them."""
+    start = glimpse.to_all(start, train) if start else None
     return fit(
         model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
         thorough=task.thorough, reach=task.reach,
@@ -315,7 +316,7 @@ def eventful(task: Task) -> bool:
 
 
 def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
-    """Fits to the first seconds from every start: the best, and others that differ from it."""
+    """Fits to a glimpse from every start: the best, and others that differ from it."""
     models = list(_starting_models(task))
     kept = _swept(models[0])
     looks = _looks(task, models, train, kept)
@@ -364,37 +365,33 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
     return replace(best, converged=found)
 
 
-def _screens(train: Sequence[Trial]) -> list[float]:
-    """Lengths of first looks that are much shorter than the records."""
-    longest = max(trial.duration for trial in train)
-    return [length for length in SCREENS_S if longest >= 2 * length]
-
-
 def _look(
     task: Task,
     model: Model,
     train: Sequence[Trial],
     only: Sequence[str] | None = None,
     start: Fit | None = None,
-    length: float = SCREENS_S[0],
+    length: float = glimpse.LENGTHS_S[0],
 ) -> Fit:
-    """A fit to the first seconds of each record: those of the base's own look, if there is one."""
+    """A fit to a glimpse of the records: as long as the base's own look, if there is one."""
+    few = [train[i] for i in glimpse.few(train)]
     return fit(
-        model, train, only, horizon=task.first.horizon if task.first else length,
+        model, few, only, horizon=task.first.horizon if task.first else length,
         iterations=SCREEN_ITERATIONS, start=start,
         own=task.events, bounds=task.bounds, reach=task.reach,
     )  # fmt: skip
 
 
 def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
-    """Fit of a task's base to the first seconds, from its fit to whole records; None without.
+    """Fit of a task's base to a glimpse, from its fit to whole records; None without.
 
-    To so many of them that something is wrong there: where nothing is, nothing can help.
+    To so many seconds that something is wrong there: where nothing is, nothing can help.
     """
     found = None
-    for length in _screens(train):
+    start = glimpse.to_few(task.base, train) if task.base else None
+    for length in glimpse.lengths(train):
         try:
-            found = _look(task, task.model, train, start=task.base, length=length)
+            found = _look(task, task.model, train, start=start, length=length)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
             break
         if found.normalised_error > SETTLED:
@@ -403,7 +400,7 @@ def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
 
 
 def deeper(task: Task, lead: Fit, train: Sequence[Trial]) -> Fit | None:
-    """Fit of a task's base to the first seconds from where an effect more has led its numbers.
+    """Fit of a task's base to a glimpse from where an effect more has led its numbers.
 
     Returns:
         The fit, if it lies clearly deeper than the base's own; None otherwise.

@@ -166,7 +166,8 @@ class Jury:
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
         own = _own_values(o) / len(self.steps)
-        if o.train.own and independent < SAYS_MORE * own * len(self.steps):
+        eventful = any(u.each == 'record' for u in o.train.own)
+        if eventful and independent < SAYS_MORE * own * len(self.steps):
             # With a push of its own a short record is matched whatever is wrong, held out or not.
             reasons.append(
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '

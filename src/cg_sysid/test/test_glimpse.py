@@ -1,0 +1,91 @@
+"""What a first look takes of the records, and what it says of all of them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid import glimpse
+from cg_sysid.candidates import Task, first_seconds, look_at, try_candidate
+from cg_sysid.identify import fit
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+
+SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+SOFTER = tuple(Spring('inner', 1.0, (x, 1.0), 150.0, 0.5) for x in (1.3, -1.3))
+
+
+@pytest.fixture(scope='module')
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+def _records(machine, seconds, setups=(SPRINGS, SPRINGS)):
+    return [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=springs), [0.1 - 0.1 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 8.0 * math.sin(2 * math.pi * (0.5 + 0.1 * k + 0.05 * t) * t)],
+            seconds, 0.004, k,
+        )
+        for k, springs in enumerate(setups)
+    ]  # fmt: skip
+
+
+def _windows(nominal, records, length=1.0):
+    return prepare(nominal, [part for record in records for part in record.segments(length)])
+
+
+def test_of_long_records_all_begin(nominal):
+    trials = prepare(nominal, _records(nominal, 8.0))
+    assert glimpse.few(trials) == [0, 1]
+    assert glimpse.lengths(trials) == [2.0]
+    assert glimpse.lengths(prepare(nominal, _records(nominal, 3.0))) == []
+
+
+def test_of_many_short_records_some_of_every_set_up(nominal):
+    trials = _windows(nominal, _records(nominal, 20.0, (SPRINGS, SPRINGS, SOFTER)))
+    few = glimpse.few(trials)
+    assert glimpse.FEWEST <= len(few) <= len(trials) / 2
+    assert {repr(trials[i].setup) for i in few} == {repr(trial.setup) for trial in trials}
+    assert {trials[i].recording for i in few} == {trial.recording for trial in trials}
+    # Of few short ones none can be spared.
+    assert glimpse.few(trials[:10]) == list(range(10))
+
+
+def test_what_few_records_say_is_a_start_for_all(nominal):
+    machine = nominal.with_effect('encoder_zero', zero=0.0)
+    records = _records(nominal, 20.0)
+    trials = _windows(nominal, records)
+    of_few = fit(machine, [trials[i] for i in glimpse.few(trials)])
+    start = glimpse.to_all(of_few, trials)
+    assert len(start.motions) == len(trials)
+    # What belongs to a recording is one and the same in all its pieces.
+    zeros = {}
+    for trial, motion in zip(trials, start.motions, strict=True):
+        zeros.setdefault(trial.recording, set()).add(float(motion[-1]))
+    assert len(zeros) == 2
+    assert all(len(values) == 1 for values in zeros.values())
+    again = fit(machine, trials, start=start)
+    assert again.converged
+    assert again.normalised_error < 1.1  # noise, within a few per cent at 5000 rows
+    back = glimpse.to_few(again, trials)
+    np.testing.assert_array_equal(back.motions[0], again.motions[0])
+
+
+def test_a_look_at_short_records_finds_what_helps(nominal):
+    machine = nominal.with_effect('torque_bias', bias=1.5)
+    train = _windows(nominal, _records(machine, 20.0))
+    base = fit(nominal, train)
+    alone = Task(nominal, base=base)
+    first = first_seconds(alone, train)
+    assert len(first.motions) == len(glimpse.few(train)) < len(train)
+    looks = {
+        name: look_at(Task(nominal, (name, None), base=base, first=first), train)
+        for name in ('torque_bias', 'gyro_bias')
+    }
+    assert looks['torque_bias'].error < 1.2 < looks['gyro_bias'].error
+    outcome = try_candidate(looks['torque_bias'].task, train, train[:3])
+    assert outcome.train.normalised_error < 1.1
+    assert outcome.train.model.values['torque_bias.bias'] == pytest.approx(1.5, rel=0.02)
