@@ -24,8 +24,9 @@ from cg_sysid.trial import Trial
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
 # so: it is the order of what integrators and interpolation differ by.
 FIDELITY = 1.5e-3
-# The same for thorough fits, whose late torques change at their own instants.
-THOROUGH_FIDELITY = 2e-4
+# The same for thorough fits to all records: their late torques change at their own instants, and
+# half their steps move chi2 by no more than 1e-6 of it.
+THOROUGH_FIDELITY = 1e-4
 # Those that may be rivals and are fitted thoroughly: a late torque that changes between rows, and
 # readings that are late instead, differ by so much before.
 COARSE_FIDELITY = 2e-2
