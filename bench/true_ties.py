@@ -5,10 +5,10 @@
 For every case of bench/hidden_effects.py in which more was named than was hidden, the machine is
 recorded once more in the same experiments, but with sensors that neither err nor round. To these
 records the true structure is fitted, and the same with the rival in place of the hidden effect;
-among small faults both have these too, as far as a robot may. What they differ by, in units of the
-noise that the sensors had, is what the data of that case can be expected to say: chi2/2 in nats.
-Below the margin of the diagnosis no method could have told the two apart, and the rival belongs to
-the answer. The row in `--raw` gets `ties`: rival -> nats.
+both may have small faults, as in a diagnosis. What they differ by, in units of the noise that the
+sensors had, is what the data of that case can be expected to say: chi2/2 in nats. Below the margin
+of the diagnosis no method could have told the two apart, and the rival belongs to the answer. The
+row in `--raw` gets `ties`: rival -> nats.
 """
 
 import argparse
@@ -45,14 +45,19 @@ def exact_sensors(machine):
     return replace(machine, sensors=sensors)
 
 
-def structures(nominal, hidden, rival, faulty):
+def structures(nominal, hidden, rival, setups):
     """Tasks with the rival in place of one of the hidden effects, at each place and at all."""
     places = LIBRARY[rival].sites(nominal.mechanism)
     for gone in hidden:
-        base, bounds = faulty(with_effects(nominal, [n for n in hidden if n != gone]))
+        others = with_effects(nominal, [name for name in hidden if name != gone])
+        base, bounds = with_imperfections(others, setups)
         for at in places:
             yield Task(base, (rival, at), bounds=bounds)
         for at in places[1:]:
+            label = LIBRARY[rival](nominal.mechanism, at).label
+            if label in {e.label for e in base.effects}:  # as a small fault
+                base = base.without_effect(label)
+                bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
             base = base.with_effect(rival, at)
         if places[1:]:
             yield Task(base, (rival, places[0]), bounds=bounds)
@@ -82,15 +87,12 @@ def ties_of(row, workers=None):
     train, held = split([led_in(trial) for trial in prepare(nominal, records)])
     setups = [trial.setup for trial in (*train, *held)]
 
-    def faulty(model):
-        return with_imperfections(model, setups) if faults else (model, {})
-
-    others, bounds = faulty(with_effects(nominal, hidden[1:]))
+    others, bounds = with_imperfections(with_effects(nominal, hidden[1:]), setups)
     truth = least([Task(others, (hidden[0], None), bounds=bounds)], train, held, workers)
     same = set(itertools.chain.from_iterable(s for s in THE_SAME if s & set(hidden)))
     rivals = [name for name in row['named'] if name not in hidden and name not in same]
     costs = [
-        least(structures(nominal, hidden, rival, faulty), train, held, workers) for rival in rivals
+        least(structures(nominal, hidden, rival, setups), train, held, workers) for rival in rivals
     ]
     return {rival: (cost - truth) / 2 for rival, cost in zip(rivals, costs, strict=True)}
 

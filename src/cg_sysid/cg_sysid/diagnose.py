@@ -51,7 +51,7 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.identify import Fit
-from cg_sysid.imperfections import imperfect, with_imperfections
+from cg_sysid.imperfections import SMOOTHING, imperfect, with_imperfections
 from cg_sysid.jury import COARSE_FIDELITY, EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
@@ -245,6 +245,9 @@ class _Search:
             if winner is not None:
                 o = self._refitted(winner[1])
                 continue
+            if plain is o and o.task.bounds and not settled(o):
+                # They came in before the causes did, and another cause could do without them.
+                plain = self._bare(o) or o
             cause = self._rather_one_cause(plain, o)
             if cause is None:
                 break
@@ -390,18 +393,30 @@ class _Search:
         for gone in (sorted(small), idle):
             if not gone:
                 continue
-            model, bounds = final.model, dict(final.task.bounds)
-            for label in gone:
-                model = model.without_effect(label)
-                bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
-            start = started_from(final.train, model, bounds)
-            task = Task(model, events=final.events, bounds=bounds, leads=(start,))
-            lean = self.race.fit([task], 'without small faults')[0]
-            if isinstance(lean, str):
+            lean = self._without_small_faults(final, gone)
+            if lean is None:
                 continue
             if self.jury.contest(lean, [final]).ranked[0][0].evidence < EARNED:
                 return lean
         return final
+
+    def _bare(self, o: Outcome) -> Outcome | None:
+        """The same without anything small that the nominal model does not state."""
+        bare = replace(o, task=replace(o.task, bounds={
+            name: size for name, size in o.task.bounds.items() if not name.endswith(SMOOTHING[0])
+        }))  # fmt: skip
+        return self._without_small_faults(bare, sorted(imperfect(o.model, o.task.bounds)))
+
+    def _without_small_faults(self, o: Outcome, gone: Sequence[str]) -> Outcome | None:
+        """The same without the small faults of these labels; None where that cannot be fitted."""
+        model, bounds = o.model, dict(o.task.bounds)
+        for label in gone:
+            model = model.without_effect(label)
+            bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
+        start = started_from(o.train, model, bounds)
+        task = Task(model, events=o.events, bounds=bounds, leads=(start,))
+        lean = self.race.fit([task], 'without small faults')[0]
+        return None if isinstance(lean, str) else lean
 
     def _setups(self) -> list[Setup]:
         return [trial.setup for trial in (*self.train, *self.held)]
