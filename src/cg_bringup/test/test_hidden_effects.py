@@ -110,3 +110,16 @@ def test_the_command_line_tells_of_every_kind_of_effect(effect, tmp_path):
     assert [cause['label'] for cause in facts['causes']] == [effect]
     assert bool(facts['causes'][0]['rivals']) == (effect == 'tether_force')
     assert (out / 'report.html').stat().st_size > 10_000
+
+
+def test_small_faults_that_came_first_hide_no_second_effect(tmp_path):
+    """Soft springs and a tilted sensor imitate a round foot, but for the last of it."""
+    nominal = Model.load(model_path(NOMINAL_MODEL))
+    hidden = {'imu_lag': {'time_constant': 0.0074}, 'foot_radius': {'radius': 0.0388}}
+    machine, _ = perturb(nominal, np.random.default_rng(2103))
+    for name, values in hidden.items():
+        machine = machine.with_effect(name, None, **values)
+    options = Options(effects=(*hidden, 'torque_bias', 'quadratic_friction'), workers=2)
+    found = diagnose(nominal, recorded(machine, 2103, tmp_path), options)
+    assert {cause.label for cause in found.causes} == set(hidden), found.summary
+    assert found.extended.held.normalised_error < 1.1  # noise, within a few per cent
