@@ -1,6 +1,6 @@
 """The race of all candidates on top of one model: who is fitted, in what order, and how far.
 
-    first look (a few seconds of each record), the light ones before the heavy
+    first look (glimpse.py), the light ones before the heavy
       -> those that look best are fitted to whole records, then all others within reach
       -> ever longer fits of those that may still win
 
@@ -121,16 +121,24 @@ class Race:
         best = min(_best(found), beaten)
         if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
             found |= self._fitted(events, f'{what}, events')
+        found |= self._in_more_depth(found, min(beaten, _error(base.base)), what)
+        return list(found.values()), [look.label for look in looks if look.label not in tried]
+
+    def _in_more_depth(
+        self, found: Mapping[str, Outcome], beaten: float, what: str
+    ) -> dict[str, Outcome]:
+        """Ever longer fits of those that may still win."""
+        found = dict(found)
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
-            going = _may_still_win(found, gained, min(beaten, _error(base.base)))
+            going = _may_still_win(found, gained, beaten)
             again = self._fitted(
                 [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
             )
             gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
             found |= {n: again[n] for n, gain in gained.items() if gain > 0}
-        return list(found.values()), [look.label for look in looks if look.label not in tried]
+        return found
 
     def lead_deeper(self, base: Task, effects: Effects, what: str) -> Fit | None:
         """Where the base's own numbers come to in the first seconds, with one effect more or none.
