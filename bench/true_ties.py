@@ -86,7 +86,6 @@ def ties_of(row, workers=None):
     records = records_of(exact_sensors(machine), row['seed'], SPRING_ERROR * faults)
     train, held = split([led_in(trial) for trial in prepare(nominal, records)])
     setups = [trial.setup for trial in (*train, *held)]
-
     others, bounds = with_imperfections(with_effects(nominal, hidden[1:]), setups)
     truth = least([Task(others, (hidden[0], None), bounds=bounds)], train, held, workers)
     same = set(itertools.chain.from_iterable(s for s in THE_SAME if s & set(hidden)))

@@ -436,15 +436,16 @@ def _warnings(fit: Fit, bounds: Collection[str]):
     ):
         if u.name in bounds:
             continue  # the bound is a statement, not a finding
+        unit = '' if u.unit == '1' else f' {u.unit}'
         span = u.upper - u.lower
         absent = value == fit.model.declarations[u.name].neutral
         if min(value - u.lower, u.upper - value) <= 1e-6 * span and not absent:
-            yield f'{u.name} = {value:.4g} {u.unit} lies at the edge of its range'
+            yield f'{u.name} = {value:.4g}{unit} lies at the edge of its range'
         if not np.isfinite(sigma):
             yield f'{u.name} cannot be identified from these records'
         elif u.name in fit.undetermined:
             yield (
-                f'{u.name} = {value:.2g} +- {sigma:.2g} {u.unit} is not determined by these '
+                f'{u.name} = {value:.2g} +- {sigma:.2g}{unit} is not determined by these '
                 'records: what acts like this need not be what it is named after'
             )
         elif share < 0.2 and np.isfinite(u.tolerance):
@@ -456,7 +457,7 @@ def _warnings(fit: Fit, bounds: Collection[str]):
             away = abs(u.to_coordinate(value) - u.to_coordinate(u.prior)) / u.tolerance
             if away > 3:
                 yield (
-                    f'{u.name} = {value:.4g} {u.unit} is {away:.1f} tolerances away from what '
+                    f'{u.name} = {value:.4g}{unit} is {away:.1f} tolerances away from what '
                     f'the model file believes ({u.prior:.4g})'
                 )
     finite = np.isfinite(np.diag(fit.covariance))
