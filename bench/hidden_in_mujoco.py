@@ -9,6 +9,9 @@ without a smooth corner, filters in closed form. Numbers are 10 to 15 % off the 
 sizes are drawn as in bench/hidden_effects.py, with the same experiments, noise and counts. The hip
 body is left out, which a plain link cannot be.
 
+A name with a slash, as `stribeck_friction/exponential`, is the same effect by another law than the
+library's: what the literature and other simulators have for it.
+
 Not here: feet that roll or give way, springs that harden and presliding, which this robot does not
 have, and `boom_mass`: to an engine a mass is a mass.
 """
@@ -161,6 +164,17 @@ def secret_of(effect: str, v: Mapping[str, float], leg_length: float) -> Secret:
             **c, **{n: filtered(c[n], time[1], v['time_constant']) for n in imu}}),
         'sensor_delay': lambda: Secret({'sensor_delay': v['delay']}),
         'none': lambda: Secret(),
+        # Tustin's law; a motor whose iron saturates; a gear out of round; grease that warms on.
+        'stribeck_friction/exponential': lambda: dry(
+            lambda t, angle, rate, load:
+                v['torque'] * np.exp(-abs(rate) / v['stribeck_rate'])),
+        'torque_saturation/tanh': lambda: Secret(
+            command=lambda u, dt: v['limit'] * np.tanh(u / v['limit'])),
+        'position_dependent_friction/twice_a_turn': lambda: dry(
+            lambda t, angle, rate, load:
+                v['torque'] * (1 + np.cos(2 * angle - v['tightest'])) / 2),
+        'friction_drift/straight': lambda: dry(
+            lambda t, angle, rate, load: v['excess'] * (1 - t / (2 * SECONDS))),
     }  # fmt: skip
     if effect not in made:
         raise SystemExit(f'no effect {effect!r} here; there are {", ".join(made)}')
@@ -175,6 +189,8 @@ EFFECTS = (
     'aerodynamic_drag', 'ankle_friction', 'tether_force', 'external_push', 'spring_damping',
     'encoder_offset', 'encoder_scale', 'encoder_eccentricity', 'gyro_bias', 'gyro_scale',
     'imu_offset', 'imu_scale', 'imu_drift', 'imu_lag', 'sensor_delay',
+    'stribeck_friction/exponential', 'torque_saturation/tanh',
+    'position_dependent_friction/twice_a_turn', 'friction_drift/straight',
 )  # fmt: skip
 
 
@@ -224,7 +240,8 @@ def case(effect: str, seed: int, workers: int | None) -> dict[str, Any]:
     for name in OFF:
         truth[name] *= float(1 + rng.choice([-1, 1]) * rng.uniform(0.1, 0.15))
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
-    values = draw_values(table[effect], rng) if effect != 'none' else {}
+    named = effect.partition('/')[0]
+    values = draw_values(table[named], rng) if effect != 'none' else {}
     secret = secret_of(effect, values, truth['leg_length'])
     records = [
         record(
@@ -238,8 +255,8 @@ def case(effect: str, seed: int, workers: int | None) -> dict[str, Any]:
         )
         for i, name in enumerate(PROGRAMME)
     ]
-    hidden = {effect: values} if effect != 'none' else {}
-    about = {'size': 1.0, 'seed': seed, 'faults': False}
+    hidden = {named: values} if effect != 'none' else {}
+    about = {'law': effect, 'size': 1.0, 'seed': seed, 'faults': False}
     return about | row_of(nominal, records, hidden, workers)
 
 

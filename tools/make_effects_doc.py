@@ -58,9 +58,10 @@ def section(effect, mechanisms) -> list[str]:
     for p in effect.parameters:
         starts = ', '.join(map(number, p.starts)) or '-'
         neutral = '-' if p.neutral is None else number(p.neutral)
+        free = 'yes' if p.free else 'shape' if p.leeway else 'no'
         lines.append(
             f'| `{p.name}` | {p.unit} | {p.description} | {number(p.lower)} to {number(p.upper)} '
-            f'| {neutral} | {starts} | {"yes" if p.free else "no"} |'
+            f'| {neutral} | {starts} | {free} |'
         )
     return [*lines, '']
 
@@ -78,9 +79,9 @@ def page() -> str:
         '',
         'A model file lists the effects that a robot has, in the order in which they act; '
         'diagnosis tries all of them. At the value in the column "vanishes at" the effect is not '
-        'there at all. "Free: no" marks parameters of shape that identification leaves alone '
-        'unless told. A new effect is one class in one file of '
-        '`src/cg_dynamics/cg_dynamics/effects`.',
+        'there at all. "Free: no" marks parameters that identification leaves alone unless told; '
+        '"shape" those of the shape of a law, which a diagnosis lets go within bounds. A new '
+        'effect is one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
         '',
     ]
     for place, words in PLACES.items():

@@ -27,6 +27,8 @@ class Parameter:
         each: What has a value of its own, 'record' (as the instant of a push) or 'recording', all
             pieces of one together; the value in a model stands for those that nobody has seen.
             Empty for a property of the machine.
+        leeway: Of a parameter of shape, a device of the model: how far from its value the law of
+            a real machine may lie, in `unit`, or as a logarithm where it is logarithmic.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Parameter:
     logarithmic: bool = False
     swept: bool = False
     each: str = ''
+    leeway: float = 0.0
 
     @property
     def default(self) -> float:

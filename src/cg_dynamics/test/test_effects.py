@@ -94,6 +94,11 @@ def test_effect_at_its_default_changes_something(bare, springs, name, site):
             {'torque': 1.2, 'stribeck_rate': 0.8},
             lambda w: -1.2 * np.exp(-((w / 0.8) ** 2)) * np.tanh(w / 0.01),
         ),
+        (
+            'stribeck_friction',
+            {'torque': 1.2, 'stribeck_rate': 0.8, 'exponent': 1.0},
+            lambda w: -1.2 * np.exp(-abs(w) / 0.8) * np.tanh(w / 0.01),
+        ),
     ],
 )
 @pytest.mark.parametrize('rate', [-2.0, -0.004, 0.004, 0.5])
@@ -102,6 +107,24 @@ def test_friction_equals_that_much_hip_torque(bare, name, values, expected, rate
     rubbed = right_side(bare.with_effect(name, **values))(x, 2.0)[0]
     pushed = right_side(bare)(x, 2.0 + expected(rate))[0]
     np.testing.assert_allclose(rubbed, pushed, rtol=1e-12)
+
+
+@pytest.mark.parametrize('torque', [-9.0, -2.1, -0.5, 0.3, 1.9, 2.0, 40.0])
+@pytest.mark.parametrize(
+    ('roundness', 'expected', 'within'),
+    [
+        (0.0, lambda x: np.clip(x, -1, 1), 1e-7),
+        (1.5, np.tanh, 0.02),  # the nearest of these curves to it, limits left alone
+        (10.0, lambda x: x / np.sqrt(1 + x**2), 0.02),
+    ],
+)
+def test_saturated_torque_clips_or_bends(bare, torque, roundness, expected, within):
+    x = np.array([0.1, -0.2, 0.3, 0.4])
+    limited = bare.with_effect('torque_saturation', limit=2.0, roundness=roundness)
+    found, other = right_side(limited)(x, torque)[0], right_side(bare)(x, 0.0)[0]
+    per_torque = right_side(bare)(x, 1.0)[0][3] - other[3]
+    delivered = (found[3] - other[3]) / per_torque
+    assert delivered == pytest.approx(2 * expected(torque / 2), abs=2 * within)
 
 
 def test_coulomb_friction_is_the_sigmoid_of_eq_4_12(bare):

@@ -14,7 +14,7 @@ from cg_dynamics.rig import Setup
 from cg_sysid import glimpse
 from cg_sysid.events import seek_events, undisturbed
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
-from cg_sysid.imperfections import SMOOTHING, Bounds, turning
+from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
@@ -164,12 +164,16 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
 
 
 def _unbound(task: Task) -> Task:
-    """A small fault that is tried as a cause is no longer bound to be small."""
-    bounds = {
-        n: b for n, b in task.bounds.items()
-        if n.endswith(SMOOTHING[0]) or not n.startswith(f'{_label(task)}.')
-    }  # fmt: skip
-    return replace(task, bounds=bounds)
+    """A small fault that is tried as a cause is no longer bound to be small.
+
+    Only the shape of its law is, where small faults are allowed for.
+    """
+    if task.effect is None or not task.bounds:
+        return task
+    own = f'{_label(task)}.'
+    shapes = {f'{own}{p.name}': p.leeway for p in LIBRARY[task.effect[0]].parameters if p.leeway}
+    others = {n: b for n, b in task.bounds.items() if not n.startswith(own)}
+    return replace(task, bounds=others | shapes)
 
 
 def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
@@ -202,7 +206,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     return Outcome(
         task, label, model, best, held_score, residuals, best.belief,
         # Small faults cost nothing: every robot has them.
-        len(best.unknowns) - len(task.bounds) + _own_count(best, (*train, *held)), events,
+        shared_unknowns(best, task.bounds) + _own_count(best, (*train, *held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),
     )  # fmt: skip
 
@@ -223,6 +227,11 @@ def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
                    iterations=THOROUGH_ITERATIONS)  # fmt: skip
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
+
+
+def shared_unknowns(found: Fit, bounds: Bounds) -> int:
+    """Number of values that all trials of a fit share, less small faults."""
+    return sum(u.name not in bounds for u in found.unknowns)
 
 
 def _own_count(found: Fit, trials: Sequence[Trial]) -> int:
@@ -551,7 +560,7 @@ def at_edge(o: Outcome) -> list[str]:
     optional = {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower
                 } if kind else set()
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
-        if not u.name.startswith(f'{o.label}.'):
+        if u.name in o.task.bounds or not u.name.startswith(f'{o.label}.'):
             continue
         low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
                          for x in (u.lower, u.upper, v))

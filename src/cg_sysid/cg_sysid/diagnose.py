@@ -51,7 +51,7 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.identify import Fit
-from cg_sysid.imperfections import SMOOTHING, imperfect, with_imperfections
+from cg_sysid.imperfections import faults_among, imperfect, with_imperfections
 from cg_sysid.jury import COARSE_FIDELITY, EARNED, MATERIAL, Contest, Jury, at_noise, settled
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
@@ -402,9 +402,7 @@ class _Search:
 
     def _bare(self, o: Outcome) -> Outcome | None:
         """The same without anything small that the nominal model does not state."""
-        bare = replace(o, task=replace(o.task, bounds={
-            name: size for name, size in o.task.bounds.items() if not name.endswith(SMOOTHING[0])
-        }))  # fmt: skip
+        bare = replace(o, task=replace(o.task, bounds=faults_among(o.model, o.task.bounds)))
         return self._without_small_faults(bare, sorted(imperfect(o.model, o.task.bounds)))
 
     def _without_small_faults(self, o: Outcome, gone: Sequence[str]) -> Outcome | None:
@@ -446,8 +444,7 @@ class _Search:
         others = self._added(final) - {label}
         key = others, bool(final.task.bounds)
         if key not in self.contests:
-            bounds = final.task.bounds
-            model = final.model.without_effect(label)
+            model, bounds = final.model.without_effect(label), final.task.bounds
             if bounds:
                 model, missing = with_imperfections(model, self._setups())
                 bounds = {**bounds, **missing}

@@ -7,9 +7,9 @@ first, each within the bounds of a sound robot. What goes beyond is for a cause 
 """
 
 from collections.abc import Mapping, Sequence
-from math import log
 
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -20,8 +20,6 @@ SOUND = {
     'imu_offset': ('offset', 2e-3),
     'spring_stiffness': ('error', 0.015),
 }
-# The rate over which dry friction turns is a device of computation, good to a factor at best.
-SMOOTHING = ('transition_rate', log(2.5))
 NEXT_TO_NOTHING = 1e-3  # of the largest size: at its neutral value an effect takes no part
 
 Bounds = Mapping[str, float]
@@ -38,8 +36,8 @@ def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bo
     bounds = {}
     for effect in model.effects:
         for declared in effect.parameters:
-            if declared.name == SMOOTHING[0]:
-                bounds[f'{effect.label}.{declared.name}'] = SMOOTHING[1]
+            if declared.leeway:
+                bounds[f'{effect.label}.{declared.name}'] = declared.leeway
     for name, (parameter, largest) in SOUND.items():
         kind = LIBRARY[name]
         if not kind.applies(setups):
@@ -55,14 +53,19 @@ def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bo
 def turning(model: Model, name: str, at: str | None) -> dict[str, float]:
     """The smoothing of an effect of dry friction: that of the model's own at the same joint."""
     added = LIBRARY[name](model.mechanism, at)
-    if all(p.name != SMOOTHING[0] for p in added.parameters):
+    if all(p.name != TRANSITION_RATE.name for p in added.parameters):
         return {}
-    at_joint = [f'{e.label}.{SMOOTHING[0]}' for e in model.effects if e.at == added.at]
+    at_joint = [f'{e.label}.{TRANSITION_RATE.name}' for e in model.effects if e.at == added.at]
     own = [model.values[name] for name in at_joint if name in model.values]
-    return {SMOOTHING[0]: own[0]} if own else {}
+    return {TRANSITION_RATE.name: own[0]} if own else {}
+
+
+def faults_among(model: Model, bounds: Bounds) -> Bounds:
+    """Those bounds that are of small faults, and not of the shape of a law."""
+    declared = model.declarations
+    return {n: b for n, b in bounds.items() if n in declared and not declared[n].leeway}
 
 
 def imperfect(model: Model, bounds: Bounds) -> set[str]:
     """Labels of the effects of a model that are small faults."""
-    names = {name.rpartition('.')[0] for name in bounds if not name.endswith(SMOOTHING[0])}
-    return {effect.label for effect in model.effects} & names
+    return {name.rpartition('.')[0] for name in faults_among(model, bounds)}

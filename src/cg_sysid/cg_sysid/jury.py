@@ -13,6 +13,7 @@ from cg_sysid.candidates import (
     at_edge,
     chi2,
     own_parameters,
+    shared_unknowns,
     strained,
     too_small,
 )
@@ -192,8 +193,7 @@ class Jury:
 def _own_values(o: Outcome) -> int:
     """All that the records have of their own: initial motions, and what the effects add."""
     motions = sum(len(motion) - len(o.train.own) for motion in (*o.train.motions, *o.held.motions))
-    shared = len(o.train.unknowns) - len(o.task.bounds)
-    return motions + o.unknowns - shared
+    return motions + o.unknowns - shared_unknowns(o.train, o.task.bounds)
 
 
 def settled(o: Outcome) -> bool:

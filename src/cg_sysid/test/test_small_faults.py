@@ -117,6 +117,30 @@ def test_springs_that_do_not_conspire_are_no_tether(nominal):
     assert (found.verdict, found.causes) == ('consistent', ())
 
 
+@pytest.mark.parametrize(
+    ('effect', 'values', 'shape', 'rival'),
+    [
+        ('stribeck_friction', {'torque': 0.9, 'stribeck_rate': 0.3}, ('exponent', 1.0),
+         'quadratic_friction'),
+        ('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant'),
+        ('position_dependent_friction', {'torque': 3.5, 'tightest': 0.4}, ('cycles', 2.0),
+         'asymmetric_friction'),
+    ],
+)  # fmt: skip
+def test_an_effect_by_another_law_is_that_effect_and_not_two(
+    nominal, effect, values, shape, rival
+):
+    """Texts differ in how friction fades and motors saturate; their machines have one cause."""
+    name, true = shape
+    machine = nominal.with_effect(effect, None, **values, **{name: true})
+    found = diagnose(nominal, _records_on(machine, _springs(200.0)),
+                     Options(effects=(effect, rival, 'viscous_friction'), workers=1))  # fmt: skip
+    assert [(c.label, c.rivals) for c in found.causes] == [(effect, ())]
+    assert found.extended.held.normalised_error < 1.1
+    value, sigma, _ = found.causes[0].parameters[name]
+    assert abs(value - true) < 4 * sigma < 0.4 * true
+
+
 def test_small_faults_stay_within_their_bounds(nominal):
     model, bounds = with_imperfections(nominal, [_springs(200.0)])
     assert imperfect(model, bounds) == {

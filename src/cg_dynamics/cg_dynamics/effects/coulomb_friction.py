@@ -1,5 +1,7 @@
 """Dry friction of a joint."""
 
+from math import log
+
 import casadi as ca
 
 from cg_dynamics.effects.effect import Effect
@@ -8,6 +10,7 @@ from cg_dynamics.parameter import Parameter
 TRANSITION_RATE = Parameter(
     'transition_rate', 'rad/s', 'rate over which the sign turns smoothly', 1e-4, 1.0,
     starts=(0.01,), scale=0.001, free=False, logarithmic=True,
+    leeway=log(2.5),
 )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Dry friction that varies with the angle of the joint."""
 
+from math import log
+
 import casadi as ca
 
 from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
@@ -8,13 +10,13 @@ from cg_dynamics.parameter import Parameter
 
 
 class PositionDependentFriction(Effect):
-    """-torque (1 + cos(angle - tightest)) / 2 tanh(rate / transition_rate)."""
+    """-torque (1 + cos(cycles angle - tightest)) / 2 tanh(rate / transition_rate)."""
 
     name = 'position_dependent_friction'
     place = 'joint'
     summary = (
         'A bearing or gear that runs out of true rubs most at one angle: '
-        '-torque (1 + cos(angle - tightest))/2 tanh(rate / transition_rate).'
+        '-torque (1 + cos(cycles angle - tightest))/2 tanh(rate / transition_rate).'
     )
     contains = ('coulomb_friction',)
     wave = ('torque', 'tightest')  # the torque is never negative: only the turn counts
@@ -24,8 +26,12 @@ class PositionDependentFriction(Effect):
             neutral=0.0, starts=(0.05, 1.0), scale=0.05,
         ),
         Parameter(
-            'tightest', 'rad', 'joint angle of most friction', -9.5, 9.5,
+            'tightest', 'rad', 'joint angle of most friction, times cycles', -9.5, 9.5,
             starts=(1.5, -1.5, 0.0), scale=0.1,
+        ),
+        Parameter(
+            'cycles', '1', 'tight places in one turn', 0.2, 10.0,
+            starts=(1.0,), scale=0.1, free=False, logarithmic=True, leeway=log(2.5),
         ),
         TRANSITION_RATE,
     )  # fmt: skip
@@ -33,5 +39,5 @@ class PositionDependentFriction(Effect):
 
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate."""
-        level = p['torque'] * (1 + ca.cos(angle - p['tightest'])) / 2
+        level = p['torque'] * (1 + ca.cos(p['cycles'] * angle - p['tightest'])) / 2
         return -level * ca.tanh(rate / p['transition_rate']), []
