@@ -21,6 +21,7 @@ from cg_dynamics.contact import contact_law
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
+from cg_sysid.by_recording import what_wanders
 from cg_sysid.candidates import (
     SAME,
     THOROUGH_ITERATIONS,
@@ -591,6 +592,11 @@ class _Search:
         final = self._thorough(final)
         causes = [_as_in(final, cause) for cause in causes]
         left = self._left(final)
+        wandering = what_wanders(
+            final, (*self.train, *self.held), self.options.effects, self.carry_out
+        ) if left else None  # fmt: skip
+        if wandering and unmodelled and unmodelled.explained > wandering.explained:
+            wandering = None  # the same for all records, and more
         if not causes:
             verdict = 'unexplained' if left else 'consistent'
         elif any(cause.rivals for cause in causes):
@@ -604,7 +610,7 @@ class _Search:
             verdict=verdict,
             summary=summary_of(
                 verdict, causes, gains, left, tuple(strained(nominal)), unmodelled,
-                self.options.effects,
+                self.options.effects, wandering,
             ),
             causes=tuple(causes),
             gains=gains,
@@ -620,6 +626,7 @@ class _Search:
                 *(self._own_judges() if causes else ()), *final.train.warnings,
             ),
             unmodelled=unmodelled,
+            wandering=wandering,
         )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
 from cg_sysid.trial import Trial
 from cg_sysid.unmodelled import NOTHING, Unmodelled
+from cg_sysid.wandering import Wandering
 
 MOST_ROUNDS = 4
 NO_GAIN = 1.1  # times the error after, below which the error before is the same
@@ -137,6 +138,8 @@ class Diagnosis:
         unmodelled: What the extended model leaves above the noise, as a learned term; None if it
             leaves nothing or no such term is significant.
         landings: What the landings of a walking robot say; None where there are too few.
+        wandering: A number that differs from recording to recording, where an error is left and
+            one explains most of it.
     """
 
     verdict: str
@@ -153,6 +156,7 @@ class Diagnosis:
     findings: tuple[str, ...] = ()
     unmodelled: Unmodelled | None = None
     landings: Landings | None = None
+    wandering: Wandering | None = None
 
 
 @dataclass(frozen=True)
@@ -213,6 +217,7 @@ def summary_of(
     strained: Sequence[str] = (),
     unmodelled: Unmodelled | None = None,
     tried: Sequence[str] | None = None,
+    wandering: Wandering | None = None,
 ) -> str:
     """The answer in a few sentences.
 
@@ -224,6 +229,7 @@ def summary_of(
         strained: Numbers that the file does not believe.
         unmodelled: What is left, as a learned term.
         tried: Effects that were tried; None for the whole library.
+        wandering: A number that differs from recording to recording.
     """
     if verdict == 'consistent':
         text = 'The model explains the records down to the noise of the sensors'
@@ -232,11 +238,12 @@ def summary_of(
         return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
     if verdict == 'unexplained':
+        known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
         whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
         return (
             f'Something is missing that no effect {whose} explains: {biggest.channel} is '
             f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
-            f'{biggest.noise:.2g}. {unmodelled.text if unmodelled else NOTHING}'
+            f'{biggest.noise:.2g}. {known or NOTHING}'
         )
     named = ', '.join(described(c) for c in causes)
     if biggest.before < NO_GAIN * biggest.after and strained:
@@ -265,6 +272,7 @@ def summary_of(
     if left:
         text += f' An error above the noise remains in {", ".join(left)}.'
         text += f' {unmodelled.text}' if unmodelled else ''
+        text += f' {wandering.text}' if wandering else ''
     return text
 
 

@@ -74,6 +74,7 @@ def diagnosis_facts(
             if channel in {g.channel for g in diagnosis.gains}
         },
         'unmodelled': _unmodelled(diagnosis),
+        'wandering': _wandering(diagnosis),
         'landings': _landings(diagnosis),
         'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
         **_fitted(diagnosis.nominal, fit),
@@ -100,6 +101,7 @@ def unusable_facts(
         'gain': {},
         'remaining_error': {},
         'unmodelled': None,
+        'wandering': None,
         'landings': None,
         'ranking': [],
         'parameters': [
@@ -168,6 +170,7 @@ def identification_facts(
             if n
         },
         'unmodelled': None,
+        'wandering': None,
         'landings': None,
         'ranking': [],
         **_fitted(model, fit),
@@ -240,6 +243,22 @@ def _cause(cause: Cause, model: Model) -> Facts:
         'events': {
             record: _values(values, cause.label, ranges)
             for record, values in cause.events.items()
+        },
+    }
+
+
+def _wandering(diagnosis: Diagnosis) -> Facts | None:
+    found = diagnosis.wandering
+    if found is None:
+        return None
+    return {
+        'name': found.name,
+        'unit': found.unit,
+        'text': found.text,
+        'explained': found.explained,
+        'values': {
+            recording: {'value': value, 'sigma': sigma}
+            for recording, (value, sigma) in found.values.items()
         },
     }
 

@@ -40,6 +40,7 @@ AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
 SHORTEST_BLOCK_S = 0.1
+MISHAP = 1 / 3  # of the error above the noise: what single mishaps leave at most, if they are it
 SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
 
@@ -175,6 +176,10 @@ class Jury:
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
                 f'judge {own:.0f} values of each record\'s own'
             )
+        left = _above_noise(o) / max(_above_noise(base), 1e-300)
+        if eventful and not at_noise(o) and left > MISHAP:
+            # A push in every record takes the edge off whatever is wrong all the time.
+            reasons.append(f'leaves {left:.0%} of the error, at most {MISHAP:.0%} allowed')
         reasons += at_edge(o) + too_small(o)
         return Candidate(
             label=o.label,
@@ -188,6 +193,10 @@ class Jury:
             parameters=own_parameters(o),
             reason='; '.join(reasons),
         )
+
+
+def _above_noise(o: Outcome) -> float:
+    return chi2(o) / samples(o) - 1
 
 
 def _own_values(o: Outcome) -> int:

@@ -15,7 +15,7 @@ from cg_sysid.report.wording import (
     parameter_words,
     undetermined_words,
 )
-from cg_sysid.text import effect_name, listed, number, scaled, sentence
+from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
 
 WORTH_NATS = 6.0  # that an experiment must promise to be worth its while
 PLACES = {
@@ -36,6 +36,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
     left = [
         *[_cause(cause) for cause in facts['causes']],
         unmodelled(facts),
+        _wandering(facts),
         landings(facts),
         _faults(facts, drawn),
         _where(facts),
@@ -54,6 +55,23 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
         tag('div', tag('div', left) if left else None, tag('div', right) if right else None,
             class_='columns' if both else 'columns one'),
         class_=f'hero {verdict}', id='answer',
+    )  # fmt: skip
+
+
+def _wandering(facts: Facts) -> Markup | None:
+    found = facts.get('wandering')
+    if found is None:
+        return None
+    rows = [
+        tag('tr', tag('td', recording, class_='mono'),
+            tag('td', measured(own['value'], own['sigma'], found['unit'])))
+        for recording, own in found['values'].items()
+    ]  # fmt: skip
+    return tag('div',
+        tag('h3', 'What differs between recordings'),
+        tag('p', found['text']),
+        tag('table', tag('tr', tag('th', 'recording'), tag('th', found['name'])), rows),
+        class_='card', id='wandering',
     )  # fmt: skip
 
 

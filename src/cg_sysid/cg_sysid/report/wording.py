@@ -43,6 +43,8 @@ def headline(facts: Facts) -> str:
     if verdict == 'unexplained':
         if facts.get('unmodelled'):
             return f'The simulation lacks {facts["unmodelled"]["what"]}'
+        if facts.get('wandering'):
+            return f'{facts["wandering"]["name"]} differs from recording to recording'
         worst = worst_channel(facts)
         at = f' in {worst}' if worst else ''
         return f'There is an error{at} that {_nothing_tried(facts)} explains'

@@ -1,0 +1,73 @@
+"""A number that differs from recording to recording is found, and not taken for something else."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.by_recording import numbers_of
+from cg_sysid.candidates import Task, try_candidate
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
+from cg_sysid.rehearse import rehearse
+from cg_sysid.trial import prepare
+from cg_sysid.unknowns import unknowns_of
+
+SETUP = Setup(springs=tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3)))
+EFFECTS = 'ground_slope', 'quadratic_friction', 'external_push'
+
+
+@pytest.fixture
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+def _session(machines):
+    return [
+        rehearse(
+            f'take_{k}', machine, SETUP, [0.1 - 0.05 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 8.0 * math.sin(2 * math.pi * (0.4 + 0.1 * k + 0.15 * t) * t)],
+            5.0, 0.004, k,
+        )
+        for k, machine in enumerate(machines)
+    ]  # fmt: skip
+
+
+def test_grease_that_warms_over_a_session_is_seen(nominal):
+    levels = [2.6, 2.3, 2.05, 1.9]
+    warm = [nominal.with_values({'coulomb_friction.torque': level}) for level in levels]
+    found = diagnose(nominal, _session(warm), Options(effects=EFFECTS, workers=1))
+    # A push in every record would take the edge off.
+    assert (found.verdict, found.causes) == ('unexplained', ())
+    assert found.wandering.name == 'coulomb_friction.torque'
+    # Values are relative to a compromise of all else.
+    values = [value for value, _ in found.wandering.values.values()]
+    assert np.diff(values) == pytest.approx(np.diff(levels), abs=0.15)
+    assert 'falling in the order of their names' in found.summary
+
+
+def test_a_robot_set_down_anew_each_time_stands_on_another_slope(nominal):
+    slopes = [0.01, -0.012, 0.02, -0.005]
+    moved = [nominal.with_effect('ground_slope', angle=slope) for slope in slopes]
+    found = diagnose(nominal, _session(moved), Options(effects=EFFECTS, workers=1))
+    assert found.wandering.name == 'ground_slope.angle', found.summary
+    values = [value for value, _ in found.wandering.values.values()]
+    assert np.diff(values) == pytest.approx(np.diff(slopes), abs=2e-3)
+
+
+def test_what_is_wrong_with_the_machine_does_not_wander(nominal):
+    machine = nominal.with_effect('stribeck_friction', torque=0.8, stribeck_rate=0.4)
+    found = diagnose(nominal, _session([machine] * 4), Options(effects=EFFECTS[:1], workers=1))
+    assert found.verdict == 'unexplained'
+    assert found.wandering is None, found.wandering
+
+
+def test_every_number_of_the_library_can_be_asked_for(nominal):
+    trials = prepare(nominal, _session([nominal] * 2))
+    base = try_candidate(Task(nominal), trials[:1], trials[1:])
+    asked = list(numbers_of(base, trials, None))
+    assert len(asked) > 15
+    for model, name in asked:
+        assert [u.name for u in unknowns_of(model, only=[name])] == [name]
