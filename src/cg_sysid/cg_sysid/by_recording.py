@@ -8,6 +8,7 @@ time and all else as it is: that which takes most of the error away is where to 
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -48,6 +49,9 @@ def what_wanders(
     total = chi2(o) - samples(o)
     if not FEWEST <= len(recordings) <= MOST or not total > 0:
         return None
+    called = [Path(recording).name for recording in recordings]
+    if len(set(called)) < len(called):
+        called = recordings
     groups = [[t for t in trials if t.recording == recording] for recording in recordings]
     numbers = list(numbers_of(o, trials, names))
     arguments = [(model, name, group, o.events) for model, name in numbers for group in groups]
@@ -58,7 +62,7 @@ def what_wanders(
         if any(isinstance(part, str) for part in own):
             continue
         explained = 1 - (sum(squares for *_, squares in own) - samples(o)) / total
-        values = {r: (value, sigma) for r, (value, sigma, _) in zip(recordings, own, strict=True)}
+        values = {r: (value, sigma) for r, (value, sigma, _) in zip(called, own, strict=True)}
         wandering.append(Wandering(name, model.declarations[name].unit, values, explained))
     if not wandering:
         return None

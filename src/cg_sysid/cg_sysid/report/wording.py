@@ -44,7 +44,7 @@ def headline(facts: Facts) -> str:
         if facts.get('unmodelled'):
             return f'The simulation lacks {facts["unmodelled"]["what"]}'
         if facts.get('wandering'):
-            return f'{facts["wandering"]["name"]} differs from recording to recording'
+            return f'From recording to recording {facts["wandering"]["name"]} differs'
         worst = worst_channel(facts)
         at = f' in {worst}' if worst else ''
         return f'There is an error{at} that {_nothing_tried(facts)} explains'
