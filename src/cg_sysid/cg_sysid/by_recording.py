@@ -2,11 +2,11 @@
 
 Grease that warms over a session, a supply that sags, a robot set down on another floor: within a
 recording a number stands still, from one to the next it does not. No effect of the library says
-so, and no function of one variable. So each number is fitted to each recording by itself, one at a
-time and all else as it is: that which takes most of the error away is where to look.
+so, and no function of one variable. So one number after the other gets a value of each recording's
+own, with all else identified anew: that which takes most of the error away is where to look.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,20 +15,17 @@ import numpy as np
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.candidates import Outcome, candidates_for, chi2
-from cg_sysid.identify import fit
-from cg_sysid.jury import samples
+from cg_sysid.candidates import Outcome, candidates_for, started_from
+from cg_sysid.identify import Fit, fit
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, unknowns_of
+from cg_sysid.unknowns import IdentificationError, own_unknowns
 from cg_sysid.wandering import Wandering
 
 FEWEST = 3  # recordings: two always differ
 MOST = 30  # recordings; of more, as the steps of a walk, none is a session
-# Share of the error above the noise that a number must take away. All else stays where it was
-# fitted without that, so that even the right one does not take all.
-EXPLAINS = 0.5
-CLEARLY = 0.7  # of what the next best number leaves, that the best may leave
-ITERATIONS = 16
+EXPLAINS = 0.7  # share of the error above the noise that a number must take away
+CLEARLY = 0.5  # of what the next best number leaves, that the best may leave
+ITERATIONS = 24
 
 Run = Callable[[Callable, list[tuple], str], list]
 
@@ -40,63 +37,97 @@ def what_wanders(
 
     Args:
         o: The model as far as it is known, fitted.
-        trials: All of them.
+        trials: Those that it was fitted to, then those held out.
         names: Effects that may be tried; None for the whole library.
         run: Calls a function with each tuple of arguments, in parallel perhaps, and tells people
             what for.
     """
-    recordings = sorted({trial.recording for trial in trials})
-    total = chi2(o) - samples(o)
-    if not FEWEST <= len(recordings) <= MOST or not total > 0:
+    recordings = list(dict.fromkeys(trial.recording for trial in trials))
+    if not FEWEST <= len(recordings) <= MOST:
         return None
-    called = [Path(recording).name for recording in recordings]
-    if len(set(called)) < len(called):
-        called = recordings
-    groups = [[t for t in trials if t.recording == recording] for recording in recordings]
-    numbers = list(numbers_of(o, trials, names))
-    arguments = [(model, name, group, o.events) for model, name in numbers for group in groups]
-    found = run(_of_recording, arguments, 'recording by recording')
-    wandering = []
-    for k, (model, name) in enumerate(numbers):
-        own = found[k * len(groups) : (k + 1) * len(groups)]
-        if any(isinstance(part, str) for part in own):
+    start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    numbers = list(numbers_of(o.train.model, trials, names))
+    arguments = [(o, *number, trials, start) for number in (('', '', None), *numbers)]
+    base, *found = run(_fit_with_own, arguments, 'recording by recording')
+    if isinstance(base, str):
+        return None
+    above = [(f.squares - f.count.sum(), f) for f in found if isinstance(f, Fit)]
+    (left, best), *others = sorted(above, key=lambda pair: pair[0]) or [(np.inf, base)]
+    explained = 1 - left / (base.squares - base.count.sum())
+    next_best = min((squares for squares, _ in others), default=np.inf)
+    if not explained > EXPLAINS or left > CLEARLY * next_best:
+        return None
+    return _wandering(best, o.model, trials, float(explained))
+
+
+def _wandering(
+    found: Fit, model: Model, trials: Sequence[Trial], explained: float
+) -> Wandering:
+    known = {u.name for u in own_unknowns(model)}
+    (place,) = (k for k, u in enumerate(found.own) if u.name not in known)
+    number, first = found.own[place], len(found.own) - place
+    values = {}
+    for trial, motion, sigmas in zip(trials, found.motions, found.own_sigmas, strict=True):
+        values[trial.recording] = float(motion[len(motion) - first]), float(sigmas[place])
+    called = {recording: Path(recording).name for recording in values}
+    if len(set(called.values())) < len(called):
+        called = {recording: recording for recording in values}
+    return Wandering(
+        number.name, number.unit, {called[r]: values[r] for r in sorted(values)}, explained
+    )
+
+
+def numbers_of(
+    model: Model, trials: Sequence[Trial], names: Sequence[str] | None
+) -> Iterator[tuple[str, str, str | None]]:
+    """(Parameter, effect, place) of sizes of effects, those of the model and those it lacks."""
+    stated = [(effect.name, effect.at) for effect in model.effects]
+    lacking = candidates_for(model, [trial.setup for trial in trials], names)
+    for name, at in (*stated, *lacking):
+        if name not in LIBRARY:
             continue
-        explained = 1 - (sum(squares for *_, squares in own) - samples(o)) / total
-        values = {r: (value, sigma) for r, (value, sigma, _) in zip(called, own, strict=True)}
-        wandering.append(Wandering(name, model.declarations[name].unit, values, explained))
-    if not wandering:
-        return None
-    best, *others = sorted(wandering, key=lambda w: -w.explained)
-    left = min((1 - other.explained for other in others), default=1.0)
-    clear = best.explained > EXPLAINS and 1 - best.explained < CLEARLY * left
-    return best if clear else None
-
-
-def numbers_of(o: Outcome, trials: Sequence[Trial], names: Sequence[str] | None):
-    """Models and the number to be fitted in each: those of the model, and sizes of effects."""
-    fitted = o.train.model
-    for unknown in unknowns_of(fitted):
-        yield _unbelieved(fitted, unknown.name), unknown.name
-    for name, at in candidates_for(fitted, [trial.setup for trial in trials], names):
         kind = LIBRARY[name]
-        size = kind.parameters[0]
         own = any(p.each for p in kind.parameters)
-        plain = not (own or kind.states or kind.extra_inputs) and size.neutral == 0.0
+        plain = not (own or kind.states or kind.extra_inputs) and kind.parameters[0].neutral == 0.0
         if plain and sum(p.free for p in kind.parameters) == 1:
-            model = fitted.with_effect(name, at, **{size.name: size.scale})
-            yield model, f'{model.effects[-1].label}.{size.name}'
+            yield kind.parameters[0].name, name, at
 
 
-def _unbelieved(model: Model, name: str) -> Model:
-    """The model with no belief in one of its numbers but that of its file."""
-    freed = replace(model.quantities[name], tolerance=None, fixed=False)
-    return replace(model, quantities={**model.quantities, name: freed})
-
-
-def _of_recording(model, name, trials, events) -> tuple[float, float, float] | str:
-    """Value, standard deviation and squared error of one number on one recording."""
+def _fit_with_own(
+    o: Outcome, parameter: str, name: str, at: str | None, trials: Sequence[Trial], start: Fit
+) -> Fit | str:
+    """A fit to all records where every recording has its own value of one parameter."""
+    model = o.model
+    if name:
+        model = with_own(model, name, at, parameter, o.train.model)
+    bounds = o.task.bounds
     try:
-        found = fit(model, trials, only=[name], own=events, iterations=ITERATIONS)
+        found = fit(
+            model, trials, start=started_from(start, model, bounds), own=o.events, bounds=bounds,
+            iterations=ITERATIONS,
+        )  # fmt: skip
+        return replace(found, model=o.model)  # a class made here does not leave this process
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
-    return float(found.values[0]), float(found.sigmas[0]), found.squares
+
+
+def with_own(
+    model: Model, name: str, at: str | None, parameter: str, fitted: Model
+) -> Model:
+    """The model in which every recording has its own value of one parameter of an effect.
+
+    The effect is added if the model lacks it. The value that stands for recordings which nobody
+    has seen is that of `fitted`.
+    """
+    kind = LIBRARY[name]
+    label = kind(model.mechanism, at).label
+    if all(effect.label != label for effect in model.effects):
+        model = model.with_effect(name, at, **{parameter: kind.parameters[0].scale})
+    else:
+        model = model.with_values({f'{label}.{parameter}': fitted.values[f'{label}.{parameter}']})
+    own = tuple(
+        replace(p, each='recording') if p.name == parameter else p for p in kind.parameters
+    )
+    marked = type(kind.__name__, (kind,), {'parameters': own})
+    effects = (e if e.label != label else marked(model.mechanism, at) for e in model.effects)
+    return replace(model, effects=tuple(effects))
