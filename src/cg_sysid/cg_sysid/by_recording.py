@@ -17,6 +17,7 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.candidates import Outcome, candidates_for, started_from
 from cg_sysid.identify import Fit, fit
+from cg_sysid.imperfections import turning
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 from cg_sysid.wandering import Wandering
@@ -51,18 +52,22 @@ def what_wanders(
     base, *found = run(_fit_with_own, arguments, 'recording by recording')
     if isinstance(base, str):
         return None
-    above = [(f.squares - f.count.sum(), f) for f in found if isinstance(f, Fit)]
-    (left, best), *others = sorted(above, key=lambda pair: pair[0]) or [(np.inf, base)]
-    explained = 1 - left / (base.squares - base.count.sum())
-    next_best = min((squares for squares, _ in others), default=np.inf)
-    if not explained > EXPLAINS or left > CLEARLY * next_best:
+    fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
+    if not fits:
         return None
-    return _wandering(best, o.model, trials, float(explained))
+    best, *others = fits
+    explained = 1 - _above_noise(best) / _above_noise(base)
+    left = min(map(_above_noise, others), default=np.inf)
+    if not explained > EXPLAINS or _above_noise(best) > CLEARLY * left:
+        return None
+    return _wandering(best, o.model, trials, explained)
 
 
-def _wandering(
-    found: Fit, model: Model, trials: Sequence[Trial], explained: float
-) -> Wandering:
+def _above_noise(found: Fit) -> float:
+    return float(found.squares - found.count.sum())
+
+
+def _wandering(found: Fit, model: Model, trials: Sequence[Trial], explained: float) -> Wandering:
     known = {u.name for u in own_unknowns(model)}
     (place,) = (k for k, u in enumerate(found.own) if u.name not in known)
     number, first = found.own[place], len(found.own) - place
@@ -111,9 +116,7 @@ def _fit_with_own(
         return str(error)
 
 
-def with_own(
-    model: Model, name: str, at: str | None, parameter: str, fitted: Model
-) -> Model:
+def with_own(model: Model, name: str, at: str | None, parameter: str, fitted: Model) -> Model:
     """The model in which every recording has its own value of one parameter of an effect.
 
     The effect is added if the model lacks it. The value that stands for recordings which nobody
@@ -122,7 +125,8 @@ def with_own(
     kind = LIBRARY[name]
     label = kind(model.mechanism, at).label
     if all(effect.label != label for effect in model.effects):
-        model = model.with_effect(name, at, **{parameter: kind.parameters[0].scale})
+        size = {parameter: kind.parameters[0].scale}
+        model = model.with_effect(name, at, **size, **turning(model, name, at))
     else:
         model = model.with_values({f'{label}.{parameter}': fitted.values[f'{label}.{parameter}']})
     own = tuple(
