@@ -15,6 +15,7 @@ from cg_sysid import glimpse
 from cg_sysid.events import seek_events, undisturbed
 from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import Bounds, turning
+from cg_sysid.text import measured
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 
@@ -547,7 +548,7 @@ def too_small(o: Outcome) -> list[str]:
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
     if abs(value - first.neutral) > TOO_SMALL * sigma:
         return []
-    return [f'{first.name} = {value:.3g} +- {sigma:.2g} {unit} is as good as none']
+    return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
 
 
 def at_edge(o: Outcome) -> list[str]:
@@ -570,5 +571,5 @@ def at_edge(o: Outcome) -> list[str]:
             margin = min(margin, 0.1 * u.scale)
         below = np.inf if u.name in optional else at - low
         if min(below, high - at) < margin:
-            found.append(f'{u.name} = {v:.3g} {u.unit} lies at the edge of its range')
+            found.append(f'{u.name} = {measured(v, None, u.unit)} lies at the edge of its range')
     return found
