@@ -137,7 +137,7 @@ class _Seeking:
                 continue
             own = found.own_by_name([trial])[trial.name]
             event = np.array([own[name] for name in self.names])
-            inside = 0.0 <= event[1] <= trial.duration
+            inside = 0.0 <= event[1] - trial.since <= trial.duration
             if inside and found.normalised_error < guess.error:
                 guess = replace(guess, event=event, error=found.normalised_error)
         return guess
@@ -163,7 +163,7 @@ def _small_events(
     grid = _instants(model.with_values({names[0]: 0.0}), trial)
     gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
     for k, t in enumerate(grid):
-        p[instant] = t
+        p[instant] = trial.since + t
         normal, _, _ = compiled.normal(
             trial.time, u, x0, s0, p, column, trial.outputs, 1 / trial.sigma
         )
@@ -175,11 +175,14 @@ def _small_events(
             gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
     peaks, _ = find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
-    return [np.array([sizes[k], grid[k]]) for k in order[:FOLLOWED]]
+    return [np.array([sizes[k], trial.since + grid[k]]) for k in order[:FOLLOWED]]
 
 
 def _instants(model: Model, trial: Trial) -> np.ndarray:
-    """Instants in s at which something may have happened: all, or those about spoilt pieces."""
+    """Instants in s from the first row, at which something may have happened.
+
+    All, or those about spoilt pieces.
+    """
     grid = np.arange(0.0, trial.duration, GRID_S)
     found = pieces(model.mechanism, trial, PIECE_S)
     try:

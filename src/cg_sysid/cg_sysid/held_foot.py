@@ -77,4 +77,5 @@ def _held(
         inputs=trial.inputs[rows],
         outputs=trial.outputs[rows],
         motion=states[first, :4],
+        since=trial.since + float(trial.time[first]),
     )

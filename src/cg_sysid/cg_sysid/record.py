@@ -34,6 +34,7 @@ class Record:
         note: The recording note as read.
         source: Path that the record was read from, or the record that it was cut from; empty if it
             was made in memory.
+        since: Time in s from the first row of what it was cut from to its own.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Record:
     setup: Setup = field(default_factory=Setup)
     note: dict[str, Any] = field(default_factory=dict)
     source: str = ''
+    since: float = 0.0
 
     def __post_init__(self) -> None:
         known = channels.mechanism(self.mechanism)
@@ -150,7 +152,7 @@ class Record:
         inputs = {c: v[rows] for c, v in self.inputs.items()}
         return replace(
             self, name=name, stamp_ns=self.stamp_ns[rows], inputs=inputs, outputs=outputs,
-            source=self.source or self.name,
+            source=self.source or self.name, since=self.since + float(time[rows][0]),
         )  # fmt: skip
 
     def segments(self, length_s: float) -> list['Record']:

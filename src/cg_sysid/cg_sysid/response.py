@@ -147,7 +147,7 @@ def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
     count = max(1, round(trial.duration / length))
     edges = np.searchsorted(trial.time, np.linspace(0, trial.duration, count + 1))
     edges[-1] = len(trial.time)
-    inputs = np.column_stack([trial.inputs, trial.time])
+    inputs = trial.inputs_for((*trial.input_names, TIME))
     found = []
     recorded = np.isfinite(trial.outputs).any(axis=0)
     for a, b in pairwise(edges):

@@ -34,6 +34,7 @@ class Trial:
         name: Name of the record.
         recording: What the record was cut from; its own name if from nothing.
         time: Stamps of the rows in s from the first, shape (n,).
+        since: Time in s from the start of the recording to the first row.
         inputs: Held inputs, shape (n, nu), in the order of `input_names`.
         input_names: Input channels.
         outputs: Measured outputs, NaN where there is no sample, shape (n, ny).
@@ -53,17 +54,19 @@ class Trial:
     setup: Setup
     motion: np.ndarray
     motion_sigma: np.ndarray
+    since: float = 0.0
 
     def inputs_for(self, names: Sequence[str]) -> np.ndarray:
         """Inputs in the order that a model wants, shape (n, len(names)).
 
-        `time` is the time of the rows; a switch that was not recorded (`drive_enabled`) counts
+        `time` is the time of the recording, as warming and drift go on through all pieces of one;
+        a switch that was not recorded (`drive_enabled`) counts
         as on.
         """
         if tuple(names) == self.input_names:
             return self.inputs
         recorded = dict(zip(self.input_names, self.inputs.T, strict=True))
-        known = {TIME: self.time, **recorded}
+        known = {TIME: self.since + self.time, **recorded}
         ones = np.ones(len(self.time))
         return np.column_stack([known.get(name, ones) for name in names])
 
@@ -130,6 +133,7 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
         setup=record.setup,
         motion=motion,
         motion_sigma=motion_sigma,
+        since=record.since,
     )
 
 
@@ -155,6 +159,7 @@ def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Tr
         piece = replace(
             trial, name=f'{trial.name}[{a}:{b}]', time=time, inputs=trial.inputs[a:b],
             outputs=outputs, motion=motion, motion_sigma=spread,
+            since=trial.since + float(trial.time[a]),
         )  # fmt: skip
         found.append((float(trial.time[a]), piece))
     return found

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from cg_dynamics.compiled import compile_model
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.model import Model
-from cg_dynamics.rig import Setup
-from cg_sysid.candidates import candidates_for
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.candidates import Task, candidates_for, events_of, try_candidate
 from cg_sysid.diagnose import split
 from cg_sysid.identify import fit
 from cg_sysid.imperfections import turning
@@ -93,3 +95,34 @@ def test_whole_recordings_are_held_out_and_pieces_only_of_a_single_one(model_fil
     train, held = split(prepare(nominal, thrice))
     assert [t.recording for t in train] == ['a', 'a', 'c', 'c']
     assert [t.recording for t in held] == ['b', 'b']
+
+
+def test_time_goes_on_through_all_pieces_of_a_recording(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('imu_drift', rate=0.01)
+    setup = Setup('inner', 'inner_fixed')
+    whole = rehearse(
+        'swing', machine, setup, [0.2, 0.5], [lambda t: 3 * np.sin(5 * t)], 8.0, 0.004
+    )
+    parts = [piece for half in whole.segments(4.0) for piece in half.segments(2.0)]
+    trials = prepare(nominal, parts)
+    assert [trial.since for trial in trials] == pytest.approx([0.0, 2.0, 4.0, 6.0], abs=0.003)
+    clocks = np.concatenate([trial.inputs_for((TIME,))[:, 0] for trial in trials])
+    np.testing.assert_allclose(clocks, whole.time, atol=1e-9)
+    found = fit(nominal.with_effect('imu_drift'), trials, only=['imu_drift.rate'])
+    assert found.normalised_error == pytest.approx(1.0, abs=0.05)
+    assert abs(found.values[0] - 0.01) < 4 * found.sigmas[0] < 0.001
+
+
+def test_a_push_is_found_in_the_piece_that_it_hit_and_by_the_time_of_the_recording(model_file):
+    nominal = Model.load(model_file)
+    springs = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+    machine = nominal.with_effect('external_push', impulse=2.0, instant=7.3, duration=0.1)
+    whole = rehearse('pushed', machine, Setup(springs=springs), [0.1, -0.1, 0.3, -0.5],
+                     [lambda t: 4 * np.sin(5 * t)], 12.0, 0.004)  # fmt: skip
+    trials = prepare(nominal, whole.segments(4.0))
+    outcome = try_candidate(Task(nominal, ('external_push', None)), trials[1:], trials[:1])
+    events = events_of(outcome, 'external_push')
+    assert max(events, key=lambda name: events[name]['impulse'][0]) == trials[1].name
+    value, sigma, _ = events[trials[1].name]['instant']
+    assert abs(value - 7.3) < 4 * sigma + 0.005
