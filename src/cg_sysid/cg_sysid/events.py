@@ -73,8 +73,8 @@ def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | 
         None where that makes no sense: many pieces cannot be simulated down to the noise
         (something is wrong all the time), or all can.
     """
-    # Pieces would have to share what belongs to a record; and a drift is told by late pieces, which
-    # a first, spoilt fit loses.
+    # Pieces would have to share what belongs to a record; and a drift is told by late pieces,
+    # which a first, spoilt fit loses.
     if own_unknowns(model) or any(TIME in effect.extra_inputs for effect in model.effects):
         return None
     whole = [piece for t in trials for _, piece in pieces(model.mechanism, t, PIECE_S)]
