@@ -179,7 +179,8 @@ class Jury:
         left = _above_noise(o) / max(_above_noise(base), 1e-300)
         if eventful and not at_noise(o) and left > MISHAP:
             # A push in every record takes the edge off whatever is wrong all the time.
-            reasons.append(f'leaves {left:.0%} of the error, at most {MISHAP:.0%} allowed')
+            reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
+                           f'{100 * MISHAP:.0f} % allowed')
         reasons += at_edge(o) + too_small(o)
         return Candidate(
             label=o.label,
