@@ -38,6 +38,6 @@ class Wandering:
         )
         return (
             f'{self.name} differs from recording to recording, {way} in the order of their names, '
-            f'from {between}: a value for each takes away {100 * self.explained:.3g} % of the error '
-            'above the noise.'
+            f'from {between}: a value for each takes away {100 * self.explained:.3g} % of the '
+            'error above the noise.'
         )
