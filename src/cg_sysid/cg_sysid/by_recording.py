@@ -48,7 +48,7 @@ def what_wanders(
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     numbers = list(numbers_of(o.train.model, trials, names))
-    arguments = [(o, *number, trials, start) for number in (('', '', None), *numbers)]
+    arguments = [(o, *number, trials, start) for number in (('', None), *numbers)]
     base, *found = run(_fit_with_own, arguments, 'recording by recording')
     if isinstance(base, str):
         return None
@@ -84,8 +84,8 @@ def _wandering(found: Fit, model: Model, trials: Sequence[Trial], explained: flo
 
 def numbers_of(
     model: Model, trials: Sequence[Trial], names: Sequence[str] | None
-) -> Iterator[tuple[str, str, str | None]]:
-    """(Parameter, effect, place) of sizes of effects, those of the model and those it lacks."""
+) -> Iterator[tuple[str, str | None]]:
+    """(Effect, place) of those that have one number, their size; of the model or not."""
     stated = [(effect.name, effect.at) for effect in model.effects]
     lacking = candidates_for(model, [trial.setup for trial in trials], names)
     for name, at in (*stated, *lacking):
@@ -95,16 +95,14 @@ def numbers_of(
         own = any(p.each for p in kind.parameters)
         plain = not (own or kind.states or kind.extra_inputs) and kind.parameters[0].neutral == 0.0
         if plain and sum(p.free for p in kind.parameters) == 1:
-            yield kind.parameters[0].name, name, at
+            yield name, at
 
 
 def _fit_with_own(
-    o: Outcome, parameter: str, name: str, at: str | None, trials: Sequence[Trial], start: Fit
+    o: Outcome, name: str, at: str | None, trials: Sequence[Trial], start: Fit
 ) -> Fit | str:
-    """A fit to all records where every recording has its own value of one parameter."""
-    model = o.model
-    if name:
-        model = with_own(model, name, at, parameter, o.train.model)
+    """A fit to all records where every recording has its own size of the effect that is named."""
+    model = with_own(o.model, name, at, o.train.model) if name else o.model
     bounds = o.task.bounds
     try:
         found = fit(
@@ -116,22 +114,19 @@ def _fit_with_own(
         return str(error)
 
 
-def with_own(model: Model, name: str, at: str | None, parameter: str, fitted: Model) -> Model:
-    """The model in which every recording has its own value of one parameter of an effect.
+def with_own(model: Model, name: str, at: str | None, fitted: Model) -> Model:
+    """The model in which every recording has its own size of an effect.
 
-    The effect is added if the model lacks it. The value that stands for recordings which nobody
+    The effect is added if the model lacks it. The size that stands for recordings which nobody
     has seen is that of `fitted`.
     """
     kind = LIBRARY[name]
-    label = kind(model.mechanism, at).label
+    label, (size, *others) = kind(model.mechanism, at).label, kind.parameters
     if all(effect.label != label for effect in model.effects):
-        size = {parameter: kind.parameters[0].scale}
-        model = model.with_effect(name, at, **size, **turning(model, name, at))
+        model = model.with_effect(name, at, **{size.name: size.scale}, **turning(model, name, at))
     else:
-        model = model.with_values({f'{label}.{parameter}': fitted.values[f'{label}.{parameter}']})
-    own = tuple(
-        replace(p, each='recording') if p.name == parameter else p for p in kind.parameters
-    )
+        model = model.with_values({f'{label}.{size.name}': fitted.values[f'{label}.{size.name}']})
+    own = (replace(size, each='recording'), *others)
     marked = type(kind.__name__, (kind,), {'parameters': own})
     effects = (e if e.label != label else marked(model.mechanism, at) for e in model.effects)
     return replace(model, effects=tuple(effects))

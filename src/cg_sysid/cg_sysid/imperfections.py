@@ -4,6 +4,9 @@ A delay of half a sample, an encoder zeroed to the width of a line, springs stif
 such small faults leave a simulation error many times the noise, and taken for the absence of
 physics they would have any cause that happens to look like them. So they may explain an error
 first, each within the bounds of a sound robot. What goes beyond is for a cause to explain.
+
+So may the shape of a law (`Parameter.leeway`): how dry friction turns and fades, how a motor
+saturates. Texts and machines differ in it, and it is no cause of its own.
 """
 
 from collections.abc import Mapping, Sequence

@@ -3,13 +3,16 @@
 import math
 
 import pytest
+from test_diagnosis_file import documented
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.by_recording import numbers_of, with_own
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
+from cg_sysid.diagnosis_file import diagnosis_facts
 from cg_sysid.identify import fit
+from cg_sysid.intake import Intake
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 from cg_sysid.unknowns import own_unknowns
@@ -37,7 +40,8 @@ def _session(machines):
 def test_grease_that_warms_over_a_session_is_seen(nominal):
     levels = [2.6, 2.3, 2.05, 1.9]
     warm = [nominal.with_values({'coulomb_friction.torque': level}) for level in levels]
-    found = diagnose(nominal, _session(warm), Options(effects=EFFECTS, workers=1))
+    records = _session(warm)
+    found = diagnose(nominal, records, Options(effects=EFFECTS, workers=1))
     # A push in every record would take the edge off.
     assert (found.verdict, found.causes) == ('unexplained', ())
     assert found.wandering.name == 'coulomb_friction.torque'
@@ -45,6 +49,12 @@ def test_grease_that_warms_over_a_session_is_seen(nominal):
         assert abs(value - level) < 4 * sigma + 0.01 * level
     assert found.wandering.explained > 0.99
     assert 'falling in the order of their names' in found.summary
+    intake = Intake(tuple(records), (), {r.name: r.name for r in records})
+    told = diagnosis_facts(found, intake, {})['wandering']
+    assert set(told) == documented('wandering')
+    assert {r: v['value'] for r, v in told['values'].items()} == {
+        r: value for r, (value, _) in found.wandering.values.items()
+    }
 
 
 def test_a_robot_set_down_anew_each_time_stands_on_another_slope(nominal):
@@ -68,9 +78,9 @@ def test_every_number_of_the_library_can_be_asked_for(nominal):
     trials = prepare(nominal, _session([nominal] * 2))
     asked = list(numbers_of(nominal, trials, None))
     assert len(asked) > 15
-    for parameter, name, at in asked:
-        model = with_own(nominal, name, at, parameter, nominal)
+    for name, at in asked:
+        model = with_own(nominal, name, at, nominal)
         (own,) = own_unknowns(model)
         assert own.each == 'recording'
-        assert own.name.endswith(f'.{parameter}')
+        assert own.name.partition('.')[0].partition('@')[0] == name
         fit(model, trials, iterations=1, horizon=0.5)
