@@ -18,6 +18,8 @@ from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import to_nanoseconds  # noqa: E402
 from cg_sysid.experiments import load_experiment  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 PATIENCE = 60.0  # s for start-up on a busy machine
 ENOUGH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 STALE_NS = 20_000_000

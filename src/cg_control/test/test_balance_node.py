@@ -17,6 +17,8 @@ from cg_control.balance_node import BalanceNode  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 T_NS = 2_000_000
 START_NS = 1_000_000_000
 

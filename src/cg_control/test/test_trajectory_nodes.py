@@ -30,6 +30,8 @@ from cg_control.tvlqr_node import TvlqrNode  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 PATIENCE = 20.0  # s; discovery on a busy machine
 
 

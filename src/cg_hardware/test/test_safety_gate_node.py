@@ -16,6 +16,8 @@ from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import SENSOR_QOS, to_stamp  # noqa: E402
 from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 
 @pytest.fixture
 def bench():

@@ -26,6 +26,8 @@ from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 from cg_hardware.simulation import SimulationSettings  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 PATIENCE = 20.0  # s; discovery on a busy machine
 
 

@@ -19,6 +19,8 @@ from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import MACHINE_QOS, to_stamp  # noqa: E402
 from cg_sysid.recover import needs_recovery, recover  # noqa: E402
 
+pytestmark = pytest.mark.alone
+
 PERIOD = 0.002  # s
 LOSS = 0.02  # s
 TOPICS = {
