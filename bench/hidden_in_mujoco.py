@@ -45,6 +45,8 @@ TEETH = 3000.0, 4.0  # N m/rad and N m s/rad of teeth that touch; the library's 
 TURN = 0.01  # rad/s, over which dry friction turns
 OFF = ('c1', 'c2', 'c4', 'c5', 'coulomb_friction.torque', 'viscous_friction.coefficient')
 PUSHED = 1  # the record with a push
+PAUSE = 2.0  # s between two recordings
+SLOW = 6.0  # times as long does grease take to warm that goes on warming from one to the next
 HALF_SINE = np.sqrt(1 / 4 - 2 / np.pi**2)  # standard deviation of a half sine over its length
 CHANNELS = ('imu_angle', 'imu_rate', 'hip_angle')
 
@@ -107,8 +109,8 @@ def filtered(x: np.ndarray, dt: float, constant: float) -> np.ndarray:
     return y
 
 
-def secret_of(effect: str, v: Mapping[str, float], leg_length: float) -> Secret:
-    """The physics of an effect of these values."""
+def secret_of(effect: str, v: Mapping[str, float], leg_length: float, begin: float) -> Secret:
+    """The physics of an effect of these values, in a recording that begins at that time in s."""
     imu = ('imu_angle', 'imu_rate')
     made: dict[str, Callable[[], Secret]] = {
         'actuator_delay': lambda: Secret({'torque_delay': v['delay']}),
@@ -175,6 +177,9 @@ def secret_of(effect: str, v: Mapping[str, float], leg_length: float) -> Secret:
                 v['torque'] * (1 + np.cos(2 * angle - v['tightest'])) / 2),
         'friction_drift/straight': lambda: dry(
             lambda t, angle, rate, load: v['excess'] * (1 - t / (2 * SECONDS))),
+        'friction_drift/session': lambda: dry(
+            lambda t, angle, rate, load:
+                v['excess'] * np.exp(-(begin + t) / v['time_constant'])),
     }  # fmt: skip
     if effect not in made:
         raise SystemExit(f'no effect {effect!r} here; there are {", ".join(made)}')
@@ -191,14 +196,15 @@ EFFECTS = (
     'imu_offset', 'imu_scale', 'imu_drift', 'imu_lag', 'sensor_delay',
     'stribeck_friction/exponential', 'torque_saturation/tanh',
     'position_dependent_friction/twice_a_turn', 'friction_drift/straight',
+    'friction_drift/session',
 )  # fmt: skip
 
 
 def record(
     name: str, experiment: str, truth: Mapping[str, float], secret: Secret, sensors: Mapping,
-    seed: int,
+    seed: int, begin: float,
 ) -> Record:
-    """One recording of MuJoCo's robot."""
+    """One recording of MuJoCo's robot, which begins at that time in s."""
     e = load_experiment(experiment)
     signal = make_signal(ExcitationSettings(**e.excitation, duration=SECONDS, seed=seed))
     rows = round(SECONDS / SAMPLE)
@@ -223,7 +229,7 @@ def record(
         outputs[channel] = np.round(values / count) * count if count else values
     return Record(
         name=name,
-        stamp_ns=(np.arange(rows) * SAMPLE * 1e9).round().astype(np.int64),
+        stamp_ns=((begin + np.arange(rows) * SAMPLE) * 1e9).round().astype(np.int64),
         inputs={'hip_torque': reported},
         outputs=outputs,
         mechanism='compass_gait',
@@ -242,19 +248,16 @@ def case(effect: str, seed: int, workers: int | None) -> dict[str, Any]:
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
     named = effect.partition('/')[0]
     values = draw_values(table[named], rng) if effect != 'none' else {}
-    secret = secret_of(effect, values, truth['leg_length'])
-    records = [
-        record(
-            f'{i}_{name}',
-            name,
-            truth,
-            # Somebody pushed once.
-            secret if effect != 'external_push' or i == PUSHED else Secret(),
-            nominal.sensors,
-            100 * seed + i,
-        )
-        for i, name in enumerate(PROGRAMME)
-    ]
+    if effect == 'friction_drift/session':
+        values['time_constant'] *= SLOW
+    records = []
+    for i, name in enumerate(PROGRAMME):
+        begin = i * (SECONDS + PAUSE)
+        secret = secret_of(effect, values, truth['leg_length'], begin)
+        if effect == 'external_push' and i != PUSHED:
+            secret = Secret()  # somebody pushed once
+        seeded = 100 * seed + i
+        records.append(record(f'{i}_{name}', name, truth, secret, nominal.sensors, seeded, begin))
     hidden = {named: values} if effect != 'none' else {}
     about = {'law': effect, 'size': 1.0, 'seed': seed, 'faults': False}
     return about | row_of(nominal, records, hidden, workers)

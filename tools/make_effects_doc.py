@@ -28,6 +28,8 @@ def number(value: float) -> str:
 
 def section(effect, mechanisms) -> list[str]:
     """The part of the page about one effect."""
+    from cg_dynamics.effects.effect import CLOCKS
+
     sites = {name: effect.sites(mechanism) for name, mechanism in mechanisms.items()}
     where = '; '.join(
         f'{name}: {", ".join(f"`{site}`" for site in found)}'
@@ -45,8 +47,9 @@ def section(effect, mechanisms) -> list[str]:
     ]
     if effect.states:
         lines.append(f'Extra states: {", ".join(f"`{state}`" for state in effect.states)}.')
-    if effect.extra_inputs:
-        names = ', '.join(f'`{name}`' for name in effect.extra_inputs)
+    recorded = [name for name in effect.extra_inputs if name not in CLOCKS]
+    if recorded:
+        names = ', '.join(f'`{name}`' for name in recorded)
         lines.append(f'Needs in the recording: {names}.')
     if math.isfinite(effect.largest_step):
         lines.append(f'Longest step of integration: {1e3 * effect.largest_step:g} ms.')
@@ -58,7 +61,7 @@ def section(effect, mechanisms) -> list[str]:
     for p in effect.parameters:
         starts = ', '.join(map(number, p.starts)) or '-'
         neutral = '-' if p.neutral is None else number(p.neutral)
-        free = 'yes' if p.free else 'shape' if p.leeway else 'no'
+        free = 'yes' if p.free else 'shape' if p.leeway else 'choice' if p.choice else 'no'
         lines.append(
             f'| `{p.name}` | {p.unit} | {p.description} | {number(p.lower)} to {number(p.upper)} '
             f'| {neutral} | {starts} | {free} |'
@@ -80,8 +83,9 @@ def page() -> str:
         'A model file lists the effects that a robot has, in the order in which they act; '
         'diagnosis tries all of them. At the value in the column "vanishes at" the effect is not '
         'there at all. "Free: no" marks parameters that identification leaves alone unless told; '
-        '"shape" those of the shape of a law, which a diagnosis lets go within bounds. A new '
-        'effect is one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
+        '"shape" those of the shape of a law, which a diagnosis lets go within bounds, '
+        '"choice" one that stays at that of its starts which explains most. A new effect is '
+        'one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
         '',
     ]
     for place, words in PLACES.items():

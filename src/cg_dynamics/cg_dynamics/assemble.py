@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects import Body, Effect
-from cg_dynamics.effects.effect import SPRING_FIELDS, TIME, reading_rate
+from cg_dynamics.effects.effect import CLOCKS, SPRING_FIELDS, reading_rate
 from cg_dynamics.lagrange import manipulator, solve_small
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -227,9 +227,10 @@ def overrides(effect: Effect, hook: str) -> bool:
 
 
 def stamped(u: np.ndarray, input_names: Sequence[str], time: float) -> np.ndarray:
-    """The inputs u, shape (nu,), with the input `time` set where a model has one."""
-    if TIME not in input_names:
+    """The inputs u, shape (nu,), with the clocks set where a model has one.
+
+    A session begins with the machine that runs.
+    """
+    if not set(CLOCKS).intersection(input_names):
         return u
-    u = np.array(u, float)
-    u[input_names.index(TIME)] = time
-    return u
+    return np.array([time if n in CLOCKS else v for n, v in zip(input_names, u, strict=True)])

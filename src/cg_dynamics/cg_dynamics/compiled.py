@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
-from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -112,7 +112,7 @@ class CompiledModel:
         self.state_names = equations.state_names
         self.parameter_names = equations.parameter_names
         self.input_names = equations.input_names
-        self._never_late = [i for i, name in enumerate(self.input_names) if name == TIME]
+        self._never_late = [i for i, name in enumerate(self.input_names) if name in CLOCKS]
         self.channels = equations.channels
         self.nx, self.nu = equations.x.shape[0], equations.u.shape[0]
         self.np, self.ny = equations.p.shape[0], equations.outputs.shape[0]

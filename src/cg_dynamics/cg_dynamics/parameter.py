@@ -19,7 +19,8 @@ class Parameter:
         neutral: Value at which the effect vanishes exactly; None where no single value does that
             (a parameter of shape).
         starts: Values from which an identification sets out when nothing is known yet.
-        free: False for a parameter of shape that identification leaves alone unless told.
+        free: False for a parameter of shape that identification leaves alone unless told, or for
+            a choice between its starts.
         scale: Typical size of a change worth noticing, in `unit`; steps and priors use it.
         logarithmic: True where the ratio of two values means more than their difference.
         swept: True for a frequency or an instant, where the error has many local minima: a first
@@ -53,6 +54,11 @@ class Parameter:
         if self.neutral is not None:
             return self.neutral
         raise ModelError(f'{self.name!r} has no default; state it')
+
+    @property
+    def choice(self) -> bool:
+        """Whether an identification tries each of the starts and stays where it set out."""
+        return not self.free and self.neutral is None and len(self.starts) > 1
 
     def check(self, value: float, owner: str) -> float:
         """Return value if it is allowed.

@@ -1,6 +1,6 @@
 """Which number differs from recording to recording?
 
-Grease that warms over a session, a supply that sags, a robot set down on another floor: within a
+A joint greased in between, a supply that sags, a robot set down on another floor: within a
 recording a number stands still, from one to the next it does not. No effect of the library says
 so, and no function of one variable. So one number after the other gets a value of each recording's
 own, with all else identified anew: that which takes most of the error away is where to look.

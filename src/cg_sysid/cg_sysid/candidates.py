@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
-from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -111,7 +111,7 @@ def candidates_for(
     An effect that needs a switch (`drive_enabled`) is tried only where that was recorded: with
     the switch always on it would be another name for a simpler effect.
     """
-    known = {*model.mechanism.inputs, TIME, *recorded}
+    known = {*model.mechanism.inputs, *CLOCKS, *recorded}
     present = {effect.label for effect in model.effects}.difference(small)
     found, asked = [], False
     for name, effect in LIBRARY.items():
@@ -135,7 +135,7 @@ def candidates_for(
 def starts_of(name: str) -> list[dict[str, float]]:
     """Values of an effect's parameters from which its identification sets out."""
     grids = [
-        [(p.name, start) for start in p.starts] if p.free and not p.each
+        [(p.name, start) for start in p.starts] if p.choice or (p.free and not p.each)
         else [(p.name, p.default if p.neutral is None else p.neutral)]
         for p in LIBRARY[name].parameters
     ]  # fmt: skip
@@ -297,14 +297,23 @@ def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
         return _whole(task, model, train, None, task.iterations)
     # The first seconds may mislead where the error has many minima: a resonance that is not
     # excited yet, a gap that is passed once.
-    best = _whole(task, model, train, leads[0], FOLLOWING)
+    best = _whole(task, _chosen(model, leads[0]), train, leads[0], FOLLOWING)
     for lead in leads[1:]:
         if best.normalised_error < SETTLED or lead.normalised_error > task.reach:
             break
-        other = _whole(task, model, train, lead, FOLLOWING)
+        other = _whole(task, _chosen(model, lead), train, lead, FOLLOWING)
         best = min(best, other, key=lambda found: found.normalised_error)
     left = task.iterations - FOLLOWING
-    return best if best.converged or left < 1 else _whole(task, model, train, best, left)
+    if best.converged or left < 1:
+        return best
+    return _whole(task, _chosen(model, best), train, best, left)
+
+
+def _chosen(model: Model, lead: Fit) -> Model:
+    """The model with the choices that a lead has made for the last of its effects."""
+    stated = lead.model.values
+    names = [f'{e.label}.{p.name}' for e in model.effects[-1:] for p in e.parameters if p.choice]
+    return model.with_values({name: stated[name] for name in names if name in stated})
 
 
 def _whole(
@@ -486,6 +495,8 @@ def chi2(o: Outcome) -> float:
 def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
     """Identified parameters of one effect: name -> (value, standard deviation, unit).
 
+    And a choice, where it is not the usual one, as something known for certain.
+
     Of what every record has of its own, that of the record where it is surest: of those that were
     fitted, if it happened in one, as held-out records take the model's own numbers for certain.
     """
@@ -495,6 +506,11 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
         for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
         if u.name.startswith(prefix)
     }
+    own = next((e.parameters for e in o.model.effects if e.label == label), ())
+    for p in own:
+        chosen = o.model.values[f'{prefix}{p.name}']
+        if p.choice and chosen != p.starts[0]:
+            shared[p.name] = chosen, 0.0, p.unit
     events = events_of(o, label)
     fitted = [events[name] for name in o.trials[0] if name in events]
     surest = max(fitted or events.values(), key=_sureness, default={})

@@ -292,7 +292,7 @@ def _told(cause: Cause, name: str) -> str:
     if len(own) > 1:
         return f'from {min(own):.3g} to {max(own):.3g}'
     value, sigma, _ = cause.parameters[name]
-    return f'= {value:.3g} +- {sigma:.1g}'
+    return f'= {value:.3g} +- {sigma:.1g}' if sigma else f'= {value:g}'
 
 
 def per_output(fit: Fit) -> np.ndarray:

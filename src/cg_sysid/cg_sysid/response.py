@@ -19,7 +19,7 @@ import numpy as np
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, compile_model
-from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.identify import fit, in_trial, score
@@ -147,7 +147,8 @@ def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
     count = max(1, round(trial.duration / length))
     edges = np.searchsorted(trial.time, np.linspace(0, trial.duration, count + 1))
     edges[-1] = len(trial.time)
-    inputs = trial.inputs_for((*trial.input_names, TIME))
+    names = (*trial.input_names, *CLOCKS)
+    inputs = trial.inputs_for(names)
     found = []
     recorded = np.isfinite(trial.outputs).any(axis=0)
     for a, b in pairwise(edges):
@@ -163,7 +164,7 @@ def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
         loose = np.repeat((LOOSE_RAD, LOOSE_RAD_S), len(motion) // 2)
         found.append(
             replace(
-                trial, time=time, inputs=inputs[a:b], input_names=(*trial.input_names, TIME),
+                trial, time=time, inputs=inputs[a:b], input_names=names,
                 outputs=outputs, motion=motion,
                 motion_sigma=np.maximum(spread, loose),
             )

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.effect import SESSION_TIME, TIME
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.noise import measure_noise
-from cg_sysid.record import Record
+from cg_sysid.record import NS_PER_S, Record
 
 LATEST = 0.02  # s by which sensors may report late
 FASTEST = 50.0  # rad/s^2, acceleration of a lively start
@@ -35,6 +35,7 @@ class Trial:
         recording: What the record was cut from; its own name if from nothing.
         time: Stamps of the rows in s from the first, shape (n,).
         since: Time in s from the start of the recording to the first row.
+        session: Time in s from the start of the session to that of the recording.
         inputs: Held inputs, shape (n, nu), in the order of `input_names`.
         input_names: Input channels.
         outputs: Measured outputs, NaN where there is no sample, shape (n, ny).
@@ -55,18 +56,20 @@ class Trial:
     motion: np.ndarray
     motion_sigma: np.ndarray
     since: float = 0.0
+    session: float = 0.0
 
     def inputs_for(self, names: Sequence[str]) -> np.ndarray:
         """Inputs in the order that a model wants, shape (n, len(names)).
 
-        `time` is the time of the recording, as warming and drift go on through all pieces of one;
-        a switch that was not recorded (`drive_enabled`) counts
-        as on.
+        `time` is the time of the recording, as warming and drift go on through all pieces of one,
+        and `session_time` that of the session; a switch that was not recorded (`drive_enabled`)
+        counts as on.
         """
         if tuple(names) == self.input_names:
             return self.inputs
         recorded = dict(zip(self.input_names, self.inputs.T, strict=True))
-        known = {TIME: self.since + self.time, **recorded}
+        time = self.since + self.time
+        known = {TIME: time, SESSION_TIME: self.session + time, **recorded}
         ones = np.ones(len(self.time))
         return np.column_stack([known.get(name, ones) for name in names])
 
@@ -81,6 +84,7 @@ def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
 
     The noise of a channel is what the model file states or what the records show, whichever is
     larger, one value for all records: a sensor does not change from one record to the next.
+    Their recordings are one session.
 
     Raises:
         ValueError: if a record is of another mechanism.
@@ -93,7 +97,33 @@ def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
                 f'of a {body.name}'
             )
     sigma = noise_floor(model, records)
-    return [as_trial(body, record, sigma) for record in records]
+    starts = session_starts(records)
+    return [
+        replace(as_trial(body, record, sigma), session=starts[recording_of(record)])
+        for record in records
+    ]
+
+
+def recording_of(record: Record) -> str:
+    """What a record was cut from; its own name if from nothing."""
+    return record.source or record.name
+
+
+def session_starts(records: Sequence[Record]) -> dict[str, float]:
+    """Time in s from the start of the first recording to that of each.
+
+    Recordings that overlap, as simulated ones do whose clocks all begin at nought, are of no one
+    session: each begins its own.
+    """
+    spans: dict[str, tuple[int, int]] = {}
+    for record in records:
+        first = int(record.stamp_ns[0]) - round(record.since * NS_PER_S)
+        begin, end = spans.get(recording_of(record), (first, first))
+        spans[recording_of(record)] = min(begin, first), max(end, int(record.stamp_ns[-1]))
+    ordered = sorted(spans.values())
+    if any(after < end for (_, end), (after, _) in itertools.pairwise(ordered)):
+        return dict.fromkeys(spans, 0.0)
+    return {name: (begin - ordered[0][0]) / NS_PER_S for name, (begin, _) in spans.items()}
 
 
 def noise_floor(model: Model, records: Sequence[Record]) -> np.ndarray:
@@ -124,7 +154,7 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     motion, motion_sigma = initial_motion(body, record.setup, time, outputs, sigma)
     return Trial(
         name=record.name,
-        recording=record.source or record.name,
+        recording=recording_of(record),
         time=time,
         inputs=np.column_stack([record.inputs[name] for name in names]),
         input_names=names,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cg_dynamics.compiled import compile_model
-from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.effect import SESSION_TIME, TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.candidates import Task, candidates_for, events_of, try_candidate
@@ -23,11 +23,12 @@ def test_model_gets_torque_time_and_switches_in_its_order(model_file):
     (trial,) = prepare(nominal, [record])
     asking = nominal.with_effect('friction_drift').with_effect('back_emf')
     names = compile_model(asking, trial.setup).input_names
-    assert names == ('hip_torque', 'time', 'drive_enabled')
+    assert names == ('hip_torque', 'time', 'session_time', 'drive_enabled')
     inputs = trial.inputs_for(names)
     np.testing.assert_array_equal(inputs[:, 0], record.inputs['hip_torque'])
     np.testing.assert_array_equal(inputs[:, 1], trial.time)
-    np.testing.assert_array_equal(inputs[:, 2], 1.0)
+    np.testing.assert_array_equal(inputs[:, 2], trial.time)
+    np.testing.assert_array_equal(inputs[:, 3], 1.0)
 
 
 def test_only_effects_that_can_show_are_tried(model_file):
@@ -112,6 +113,26 @@ def test_time_goes_on_through_all_pieces_of_a_recording(model_file):
     found = fit(nominal.with_effect('imu_drift'), trials, only=['imu_drift.rate'])
     assert found.normalised_error == pytest.approx(1.0, abs=0.05)
     assert abs(found.values[0] - 0.01) < 4 * found.sigmas[0] < 0.001
+
+
+def test_recordings_that_follow_one_another_are_a_session(model_file):
+    nominal = Model.load(model_file)
+    setup = Setup('inner', 'inner_fixed')
+    made = rehearse('swing', nominal, setup, [0.2, 0.5], [lambda t: 3 * np.sin(5 * t)], 4.0, 0.004)
+
+    def taken(*begins_s):
+        return [
+            replace(made, name=f'{begin} s', stamp_ns=made.stamp_ns + round((7 + begin) * 1e9))
+            for begin in begins_s
+        ]
+
+    late, first, second = taken(60.0, 0.0, 4.5)
+    trials = prepare(nominal, [late, *first.segments(2.0), *second.segments(2.0)])
+    assert [t.session for t in trials] == pytest.approx([60.0, 0.0, 0.0, 4.5, 4.5])
+    clock = trials[-1].inputs_for((SESSION_TIME,))[:, 0]
+    np.testing.assert_allclose(clock, 4.5 + trials[-1].since + trials[-1].time)
+    # Two robots at once, or simulated ones whose clocks begin anew: whose session would it be?
+    assert {t.session for t in prepare(nominal, taken(0.0, 3.9, 60.0))} == {0.0}
 
 
 def test_a_push_is_found_in_the_piece_that_it_hit_and_by_the_time_of_the_recording(model_file):

@@ -1,7 +1,9 @@
 """A number that differs from recording to recording is found, and not taken for something else."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from test_diagnosis_file import documented
 
@@ -55,6 +57,35 @@ def test_grease_that_warms_over_a_session_is_seen(nominal):
     assert {r: v['value'] for r, v in told['values'].items()} == {
         r: value for r, (value, _) in found.wandering.values.items()
     }
+
+
+@pytest.mark.parametrize('goes_on', [True, False])
+def test_grease_that_goes_on_warming_is_told_from_grease_that_warms_anew(nominal, goes_on):
+    excess, time_constant, every = 0.8, 9.0, 8.0
+    begins = every * np.arange(4)
+    warm = [
+        nominal.with_effect(
+            'friction_drift',
+            excess=excess * math.exp(-begin / time_constant) if goes_on else excess,
+            time_constant=time_constant,
+        )
+        for begin in begins
+    ]
+    records = [
+        replace(record, stamp_ns=record.stamp_ns + round(begin * 1e9))
+        for record, begin in zip(_session(warm), begins, strict=True)
+    ]
+    options = Options(effects=(*EFFECTS, 'friction_drift', 'coulomb_friction'), workers=1)
+    found = diagnose(nominal, records, options)
+    (cause,) = found.causes
+    assert (found.verdict, cause.label) == ('explained', 'friction_drift'), found.summary
+    assert found.wandering is None
+    chosen = cause.parameters.pop('whole_session', (0.0, 0.0, '1'))
+    assert chosen == (float(goes_on), 0.0, '1')
+    assert found.extended.model.values['friction_drift.whole_session'] == goes_on
+    for name, true in {'excess': excess, 'time_constant': time_constant}.items():
+        value, sigma, _ = cause.parameters[name]
+        assert abs(value - true) < 4 * sigma < 0.4 * true
 
 
 def test_a_robot_set_down_anew_each_time_stands_on_another_slope(nominal):

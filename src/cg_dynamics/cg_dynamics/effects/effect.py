@@ -10,9 +10,9 @@ path is the order of the hooks below, so any effects compose:
 
 In every hook `p` maps the effect's own parameter names to symbols and `z` holds its own extra
 states, a list; a hook that owns states returns their rates in the same order. Inputs that an
-effect asks for by name in `extra_inputs` come in `p` too: the reported torques, the time since
-the start of the record (`time`, in s), and recorded switches, which count as on where no one
-recorded them. In `read`, `p` also has the rates of the angles that ideal sensors would report.
+effect asks for by name in `extra_inputs` come in `p` too: the reported torques, the clocks, and
+recorded switches, which count as on where no one recorded them. In `read`, `p` also has the rates
+of the angles that ideal sensors would report.
 """
 
 import math
@@ -29,7 +29,9 @@ from cg_dynamics.rig import Setup
 
 Symbols = Mapping[str, ca.SX]
 SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
-TIME = 'time'  # the extra input that is the time since the start of the record, in s
+# Extra inputs that are clocks, in s: since the start of the recording, and since that of the first
+# recording of its session.
+TIME, SESSION_TIME = CLOCKS = 'time', 'session_time'
 
 
 def reading_rate(channel: str) -> str:

@@ -3,21 +3,23 @@
 import casadi as ca
 
 from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
-from cg_dynamics.effects.effect import TIME, Effect
+from cg_dynamics.effects.effect import CLOCKS, SESSION_TIME, TIME, Effect
 from cg_dynamics.parameter import Parameter
 
 
 class FrictionDrift(Effect):
     """-excess exp(-time / time_constant) tanh(rate / transition_rate).
 
-    It comes on top of the Coulomb level. A negative excess is friction that grows.
+    It comes on top of the Coulomb level. A negative excess is friction that grows. A machine that
+    rests between recordings warms anew in each; one that hardly does goes on where it was.
     """
 
     name = 'friction_drift'
     place = 'joint'
     summary = (
         'Grease warms up: dry friction starts off by an excess that fades with the time of the '
-        'record, -excess exp(-time / time_constant) tanh(rate / transition_rate).'
+        'recording or of the whole session, '
+        '-excess exp(-time / time_constant) tanh(rate / transition_rate).'
     )
     contains = ('coulomb_friction',)
     parameters = (
@@ -29,12 +31,17 @@ class FrictionDrift(Effect):
             'time_constant', 's', 'time in which the excess fades to 1/e', 0.2, 600.0,
             starts=(2.0, 10.0), scale=0.5, logarithmic=True,
         ),
+        Parameter(
+            'whole_session', '1', '1 if time goes on from recording to recording, 0 if it begins '
+            'anew in each', 0.0, 1.0, starts=(0.0, 1.0), free=False,
+        ),
         TRANSITION_RATE,
     )  # fmt: skip
-    extra_inputs = (TIME,)
+    extra_inputs = CLOCKS
     largest_step = 0.002
 
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate, less and less."""
-        level = p['excess'] * ca.exp(-p[TIME] / p['time_constant'])
+        time = p[TIME] + p['whole_session'] * (p[SESSION_TIME] - p[TIME])
+        level = p['excess'] * ca.exp(-time / p['time_constant'])
         return -level * ca.tanh(rate / p['transition_rate']), []
