@@ -29,6 +29,7 @@ from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknow
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
+CORRELATION_S = 0.2  # of model error: the order of a motion's own
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
@@ -206,7 +207,7 @@ def fit(
         )
         if ahead.point is not None:
             found = ahead
-            weight = _weight(ahead.point) if reweight else 1.0
+            weight = _weight(problem, ahead.point) if reweight else 1.0
         if found.hopeless:
             iterations = 0
             break
@@ -222,7 +223,7 @@ def fit(
                 f'({", ".join(t.name for t in trials)}); its values are too far off, or the '
                 'records are too long for an unstable motion: cut them into windows'
             )
-        new = _weight(found.point) if reweight else 1.0
+        new = _weight(problem, found.point) if reweight else 1.0
         # A minimum under weights that are about to change is none yet.
         converged = found.converged and bool(abs(np.log(new / weight)) < STEADY)
         if converged or found.hopeless:
@@ -388,13 +389,13 @@ def _unseen(
     return np.diag(point.shared_hessian) * scales**2 < weight
 
 
-def _weight(point: Point) -> float:
+def _weight(problem: Problem, point: Point) -> float:
     # Residuals far above the noise are model error: correlated over many samples, so that each
-    # sample says much less than white noise of that size would. One hundredth of the samples is
-    # the order of a motion's correlation time (0.2 s at 500 Hz).
+    # says much less than white noise of that size would.
     excess = max(1.0, point.sse.sum() / point.count.sum())
-    correlation = 1 + 99 * (1 - 1 / excess)
-    return 1 / (excess * correlation)
+    step = np.median(np.concatenate([np.diff(trial.time) for trial in problem.trials]))
+    together = max(1.0, CORRELATION_S / step)
+    return 1 / (excess * (1 + (together - 1) * (1 - 1 / excess)))
 
 
 def _as_waves_are_written(

@@ -29,7 +29,8 @@ class Problem:
 
     What a trial has of its own is one vector: its initial motion, then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
-    `guesses`, give or take `spreads`. `refinement` integration steps are taken in place of one.
+    `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
+    place of one.
     """
 
     model: Model
@@ -78,6 +79,16 @@ class Problem:
             for i in block.trials[1:]:
                 # What a recording has of its own is believed once.
                 self.spreads[i][len(self.spreads[i]) - len(shared) :][shared] = np.inf
+
+    def spread(self, i: int, weight: float) -> np.ndarray:
+        """How far what trial i has of its own may lie from its first guess.
+
+        The guess of a motion was made from the same data and weighs as they do: a simulation that
+        is wrong starts as far from where the machine did as it goes on.
+        """
+        scale = np.ones(len(self.spreads[i]))
+        scale[: len(scale) - len(self.own)] /= np.sqrt(weight)
+        return self.spreads[i] * scale
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Coordinates -> values."""
@@ -224,9 +235,10 @@ def evaluate(
         h[:, m2:] *= chain
         g[m2:] *= chain
         sse[i], count[i] = normal.sse, normal.count
-        away = (motions[i] - problem.guesses[i]) / problem.spreads[i]
-        own_h = h[:m2, :m2] + np.diag(1 / problem.spreads[i] ** 2)
-        own_g = g[:m2] + away / problem.spreads[i]
+        spread = problem.spread(i, weight)
+        away = (motions[i] - problem.guesses[i]) / spread
+        own_h = h[:m2, :m2] + np.diag(1 / spread**2)
+        own_g = g[:m2] + away / spread
         own[i] = own_h, h[:m2, m2:], own_g
         shared_h += h[m2:, m2:]
         shared_g += g[m2:]
