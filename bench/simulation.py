@@ -26,11 +26,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from cg_description.paths import model_path
-from cg_dynamics import compiled as compiled_module
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import FLAGS as BATCH_FLAGS
 from cg_dynamics.batch import batch_source, simulate_batch
-from cg_dynamics.compiled import CompiledModel, assemble, compile_model, compiler
+from cg_dynamics.c_compiler import build, compiler
+from cg_dynamics.compiled import CompiledModel, assemble, compile_model, sources
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -262,16 +262,18 @@ def build_times() -> dict[str, float]:
     c = compile_model(model, SETUP)
     found = {}
     start = cpu_time()
-    source = compiled_module._source(assemble(model, SETUP), c.free)
+    functions, rollouts = sources(assemble(model, SETUP), c.free)
     found['equations and C source'] = cpu_time() - start
-    gcc = compiler()
-    if gcc is not None:
+    if compiler() is not None:
         with tempfile.TemporaryDirectory() as directory:
+            start, shared = cpu_time(), Path(directory) / 'rollouts.o'
+            build(rollouts, shared)
+            found['C compiler, rollouts that models of the same sizes share'] = cpu_time() - start
             start = cpu_time()
-            compiled_module._compile(source, Path(directory) / 'a.so', gcc)
+            build(functions, Path(directory) / 'a.so', objects=[shared])
             found['C compiler, with sensitivities'] = cpu_time() - start
             start = cpu_time()
-            compiled_module._compile(batch_source(c), Path(directory) / 'b.so', gcc, BATCH_FLAGS)
+            build(batch_source(c), Path(directory) / 'b.so', BATCH_FLAGS)
             found['C compiler, batch'] = cpu_time() - start
     return found
 

@@ -29,7 +29,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import acting_effects, assemble, parameter_names
-from cg_dynamics.compiled import FLAGS, compiler, shared_library
+from cg_dynamics.c_compiler import FLAGS, compiler, shared_library
 from cg_dynamics.hybrid import other
 from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms.compass_gait import CompassGait

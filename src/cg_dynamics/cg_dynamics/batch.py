@@ -8,9 +8,7 @@ one after the other.
 
 import ctypes
 import functools
-import hashlib
 import logging
-import platform
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +16,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from cg_dynamics import compiled as scalar
+from cg_dynamics.c_compiler import compiler, shared_library
 from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
@@ -30,7 +28,7 @@ WIDTH = 8
 # No -fassociative-math: vector_math.c rounds by adding and subtracting a large number.
 FLAGS = (
     '-O2', '-march=native', '-fno-math-errno', '-fno-trapping-math', '-fno-signed-zeros',
-    '-freciprocal-math', '-ffp-contract=fast', '-shared', '-fPIC',
+    '-freciprocal-math', '-ffp-contract=fast',
 )  # fmt: skip
 
 BINARY = {
@@ -167,20 +165,14 @@ def simulate_batch(
 @functools.cache
 def batch_library(compiled: CompiledModel) -> ctypes.CDLL | None:
     """The vector code of a model, built when first needed; None where that cannot be."""
-    gcc = scalar.compiler()
-    if gcc is None:
+    if compiler() is None:
         return None
     try:
         source = batch_source(compiled)
     except UnsupportedError as error:
         log.warning('rollouts run one by one: %s', error)
         return None
-    key = '\n'.join([source, *FLAGS, gcc, platform.machine(), scalar._cpu()])
-    digest = hashlib.sha256(key.encode()).hexdigest()[:32]
-    target = scalar.cache_directory() / f'{digest}.so'
-    if not target.exists():
-        scalar._compile(source, target, gcc, FLAGS)
-    library = ctypes.CDLL(str(target))
+    library = ctypes.CDLL(str(shared_library(source, FLAGS)))
     number, count, index, array = (
         ctypes.c_double, ctypes.c_int, ctypes.c_long, ctypes.c_void_p,
     )  # fmt: skip

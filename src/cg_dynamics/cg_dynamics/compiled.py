@@ -6,14 +6,7 @@ interface runs on CasADi's virtual machine (fallback.py), slower, and says so on
 """
 
 import ctypes
-import functools
-import hashlib
 import logging
-import os
-import platform
-import shutil
-import subprocess
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
+from cg_dynamics.c_compiler import compiler, object_file, shared_library
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
@@ -29,37 +23,13 @@ from cg_dynamics.rig import Setup
 
 log = logging.getLogger(__name__)
 
-# -O2 takes a third longer to compile, hundreds of times in a diagnosis, and runs no faster.
-# No -ffast-math: runaway states are found by comparisons that must see NaN.
-FLAGS = (
-    '-O1', '-ftree-vectorize', '-march=native', '-fno-math-errno', '-fno-trapping-math',
-    '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math', '-ffp-contract=fast',
-    '-shared', '-fPIC',
-)  # fmt: skip
 MAX_COLUMNS = 64
+WORK = 256  # numbers by which work space grows, so that models share rollouts
 REFERENCE_STEP = 0.002
 TOLERANCE = 3e-7  # error of a step in units of the state scales; play multiplies it
 SMALLEST_STEP = 1e-4
 SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
-
-
-def cache_directory() -> Path:
-    """Where compiled models are kept; CG_CACHE overrides the user's cache directory.
-
-    Absolute, as a library that is named by its file alone is looked for in the system's places.
-    """
-    default = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'compass_gait'
-    return Path(os.environ.get('CG_CACHE') or default).absolute()
-
-
-@functools.cache
-def compiler() -> str | None:
-    """Path of a C compiler, or None; CG_COMPILER overrides, empty means none."""
-    named = os.environ.get('CG_COMPILER')
-    if named is not None:
-        return shutil.which(named) if named else None
-    return next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
 
 
 @dataclass(frozen=True)
@@ -458,37 +428,17 @@ def _build(model: Model, setup: Setup, free: tuple[str, ...]) -> CompiledModel:
     if compiler() is None:
         log.warning('no C compiler found: models run on the CasADi virtual machine, slower')
         return CompiledModel(equations, free, None)
-    return CompiledModel(equations, free, shared_library(_source(equations, free)))
+    return CompiledModel(equations, free, library_of(equations, free))
 
 
-def shared_library(source: str, flags: tuple[str, ...] = FLAGS) -> Path:
-    """Compiled C source, from the cache if it was compiled before on this kind of machine.
-
-    Args:
-        source: The C source; math.h is linked.
-        flags: Of the compiler.
-    """
-    gcc = compiler()
-    if gcc is None:
-        raise RuntimeError('no C compiler found (cc, gcc, clang)')
-    key = '\n'.join([source, *flags, gcc, platform.machine(), _cpu()])
-    target = cache_directory() / f'{hashlib.sha256(key.encode()).hexdigest()[:32]}.so'
-    if not target.exists():
-        _compile(source, target, gcc, flags)
-    return target
+def library_of(e: Equations, free: tuple[str, ...]) -> Path:
+    """The shared library of equations and their sensitivities to some parameters."""
+    functions, rollouts = sources(e, free)
+    return shared_library(functions, objects=[object_file(rollouts)])
 
 
-@functools.cache
-def _cpu() -> str:
-    # A cache on a shared home must not hand one machine the other's instructions.
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line for line in lines if line.startswith('flags')), '')
-
-
-def _source(e: Equations, free: tuple[str, ...]) -> str:
+def sources(e: Equations, free: tuple[str, ...]) -> tuple[str, str]:
+    """C of a model's functions and their derivatives, and of the rollouts that call them."""
     symbols = _pick(e, free)
     arguments = [e.x, e.u, e.p]
 
@@ -518,6 +468,11 @@ def _source(e: Equations, free: tuple[str, ...]) -> str:
     generator = ca.CodeGenerator('cgm', {'with_header': False})
     for item in functions:
         generator.add(item)
+    return generator.dump(), _rollouts(e, free, max(item.sz_w() for item in functions))
+
+
+def _rollouts(e: Equations, free: tuple[str, ...], work: int) -> str:
+    """rollout.c for functions of these sizes: many models have the same, and share its object."""
     sizes = {
         'NX': e.x.shape[0],
         'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
@@ -525,25 +480,11 @@ def _source(e: Equations, free: tuple[str, ...]) -> str:
         'NP': e.p.shape[0],
         'NF': len(free),
         'NY': e.outputs.shape[0],
-        'W': max(item.sz_w() for item in functions) + 1,
+        'W': WORK * (work // WORK + 1),
     }
     defines = '\n'.join(f'#define {name} {value}' for name, value in sizes.items())
     runtime = (Path(__file__).parent / 'rollout.c').read_text()
-    return '\n'.join([generator.dump(), defines, runtime])
-
-
-def _compile(source: str, target: Path, gcc: str, flags: tuple[str, ...] = FLAGS) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as directory:
-        c, so = Path(directory) / 'model.c', Path(directory) / 'model.so'
-        c.write_text(source)
-        result = subprocess.run(
-            [gcc, *flags, '-o', str(so), str(c), '-lm'], capture_output=True, text=True
-        )
-        if result.returncode:
-            raise RuntimeError(f'{gcc} failed on a generated model:\n{result.stderr[:2000]}')
-        # Two processes may build the same model; the last rename wins and both are equal.
-        os.replace(so, target)
+    return f'{defines}\n{runtime}'
 
 
 def _bind(library: Path) -> ctypes.CDLL:

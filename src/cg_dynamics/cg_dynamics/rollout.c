@@ -1,9 +1,9 @@
 /* Rollouts of one compiled model, with forward sensitivities.
 
-   Included below the code that CasADi generates for that model, which defines
+   Linked with the code that CasADi generates for that model, which defines
      cgm_f (x, u, p) -> dx/dt              cgm_fs -> dx/dt, d/dx, d/du, d/dfree   (row-major)
      cgm_h (x, u, p) -> y                  cgm_hs -> y, d/dx, d/dfree             (row-major)
-   and the sizes NX, NU, NP, NF (free parameters), NY, and W (work space of the functions).
+   Given are the sizes NX, NU, NP, NF (free parameters), NY, and W (work space of the functions).
 
    Rows k = 0 .. n-1 are instants; the input of row k is held until row k+1, dt[k] later. A
    sensitivity matrix S has NX rows and nc columns: first the initial state or whatever S0 says,
@@ -11,6 +11,11 @@
 
 #include <math.h>
 #include <string.h>
+
+int cgm_f(const double **arg, double **res, long long *iw, double *w, int mem);
+int cgm_fs(const double **arg, double **res, long long *iw, double *w, int mem);
+int cgm_h(const double **arg, double **res, long long *iw, double *w, int mem);
+int cgm_hs(const double **arg, double **res, long long *iw, double *w, int mem);
 
 #define MAX_COLUMNS 64
 #define STATE_LIMIT 1e6

@@ -7,7 +7,8 @@ import pytest
 from cg_dynamics import batch as module
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import Feedback, UnsupportedError, batch_library, simulate_batch
-from cg_dynamics.compiled import compile_model, compiler
+from cg_dynamics.c_compiler import compiler
+from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.rig import Setup
 

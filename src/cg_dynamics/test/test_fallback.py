@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 
+from cg_dynamics import c_compiler
 from cg_dynamics import compiled as module
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, compile_model
@@ -23,7 +24,7 @@ EFFECTS = [
 
 @pytest.fixture(params=EFFECTS, ids='+'.join)
 def pair(request, bare, springs):
-    if module.compiler() is None:
+    if c_compiler.compiler() is None:
         pytest.skip('no C compiler on this machine: there is nothing to compare with')
     model = bare
     for name in request.param:
@@ -100,13 +101,13 @@ def test_runaway_is_found_at_the_same_row(bare):
 
 def test_without_a_compiler_it_is_used_and_says_so(bare, monkeypatch, caplog):
     monkeypatch.setenv('CG_COMPILER', '')
-    module.compiler.cache_clear()
+    c_compiler.compiler.cache_clear()
     monkeypatch.setattr(module, '_built', {})
     try:
         with caplog.at_level(logging.WARNING):
             compiled = compile_model(bare, Setup())
     finally:
         monkeypatch.undo()
-        module.compiler.cache_clear()
+        c_compiler.compiler.cache_clear()
     assert isinstance(compiled._c, InterpretedRollout)
     assert 'no C compiler' in caplog.text

@@ -27,7 +27,7 @@ from typing import Any, cast
 import cg_description
 import cg_dynamics
 import cg_sysid
-from cg_dynamics.compiled import compiler
+from cg_dynamics.c_compiler import compiler
 from cg_sysid.provenance import software
 
 ADDRESS = re.compile(r'(tcp|tls)://(\[[0-9a-fA-F:.%\w]+\]|[^\[\]/:\s]+):\d{1,5}')

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup, Spring
+from cg_sysid.identify import fit
+from cg_sysid.rehearse import rehearse
 from cg_sysid.simulation_error import Border, Point, reduced
+from cg_sysid.trial import prepare
 
 
 def _point(own_hessian, coupling, own_gradient):
@@ -34,3 +39,32 @@ def test_a_direction_that_rounding_has_lost_is_no_failure():
     assert np.isfinite(gradient).all()
     # The sum of the unknowns goes where the data say, by equal shares.
     assert factors[0][:, -1] == pytest.approx([1e-20, 1e-20], rel=1e-6)
+
+
+def _short_pieces(machine, sample_time):
+    springs = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
+    whole = rehearse('swing', machine, Setup(springs=springs), [0.1, -0.1, 0.3, -0.5],
+                     [lambda t: 6 * np.sin(5 * t)], 12.0, sample_time)  # fmt: skip
+    return whole.segments(0.6)
+
+
+def test_a_wrong_simulation_starts_where_it_errs_least(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('cogging_torque', amplitude=20.0, cycles=9.0, phase=0.3)
+    trials = prepare(nominal, _short_pieces(machine, 0.004))
+    best, found = (fit(nominal, trials, only=[], reweight=weighs) for weighs in (False, True))
+    assert best.normalised_error > 1000
+    # The guesses of the initial motions are believed no more than the samples behind them.
+    assert found.normalised_error == pytest.approx(best.normalised_error, rel=1e-3)
+
+
+def test_model_error_counts_by_its_time_and_not_by_its_samples(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('cogging_torque', amplitude=20.0, cycles=9.0, phase=0.3)
+    dense, sparse = (fit(nominal, prepare(nominal, _short_pieces(machine, sample_time)))
+                     for sample_time in (0.002, 0.008))  # fmt: skip
+    # Model error is a smooth curve: four times as many samples of it say nothing new.
+    assert dense.count.sum() > 3.9 * sparse.count.sum()
+    assert dense.inflation / sparse.inflation == pytest.approx(
+        4 * dense.normalised_error / sparse.normalised_error, rel=0.05
+    )
