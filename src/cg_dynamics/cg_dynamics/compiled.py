@@ -18,6 +18,7 @@ from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_
 from cg_dynamics.c_compiler import compiler, object_file, shared_library
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
+from cg_dynamics.fallback import EASY, HALVINGS, STABLE, STATE_LIMIT, InterpretedRollout
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
@@ -101,8 +102,6 @@ class CompiledModel:
         self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], [ca.jacobian(e.rates, e.x)])
         self.has_delays = not delays.is_zero()
         if library is None:
-            from cg_dynamics.fallback import InterpretedRollout
-
             self._c: Any = InterpretedRollout(equations, free)
         else:
             self._c = _bind(library)
@@ -473,7 +472,7 @@ def sources(e: Equations, free: tuple[str, ...]) -> tuple[str, str]:
 
 def _rollouts(e: Equations, free: tuple[str, ...], work: int) -> str:
     """rollout.c for functions of these sizes: many models have the same, and share its object."""
-    sizes = {
+    given = {
         'NX': e.x.shape[0],
         'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
         'NU': e.u.shape[0],
@@ -481,8 +480,13 @@ def _rollouts(e: Equations, free: tuple[str, ...], work: int) -> str:
         'NF': len(free),
         'NY': e.outputs.shape[0],
         'W': WORK * (work // WORK + 1),
+        'MAX_COLUMNS': MAX_COLUMNS,
+        'STATE_LIMIT': STATE_LIMIT,
+        'HALVINGS': HALVINGS,
+        'STABLE': STABLE,
+        'EASY': EASY,
     }
-    defines = '\n'.join(f'#define {name} {value}' for name, value in sizes.items())
+    defines = '\n'.join(f'#define {name} {value}' for name, value in given.items())
     runtime = (Path(__file__).parent / 'rollout.c').read_text()
     return f'{defines}\n{runtime}'
 

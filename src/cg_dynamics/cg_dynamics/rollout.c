@@ -3,7 +3,8 @@
    Linked with the code that CasADi generates for that model, which defines
      cgm_f (x, u, p) -> dx/dt              cgm_fs -> dx/dt, d/dx, d/du, d/dfree   (row-major)
      cgm_h (x, u, p) -> y                  cgm_hs -> y, d/dx, d/dfree             (row-major)
-   Given are the sizes NX, NU, NP, NF (free parameters), NY, and W (work space of the functions).
+   Given are the sizes NX, NU, NP, NF (free parameters), NY, W (work space of the functions) and
+   MAX_COLUMNS, the SCALES of the states, and what fallback.py says of STATE_LIMIT and of steps.
 
    Rows k = 0 .. n-1 are instants; the input of row k is held until row k+1, dt[k] later. A
    sensitivity matrix S has NX rows and nc columns: first the initial state or whatever S0 says,
@@ -16,12 +17,6 @@ int cgm_f(const double **arg, double **res, long long *iw, double *w, int mem);
 int cgm_fs(const double **arg, double **res, long long *iw, double *w, int mem);
 int cgm_h(const double **arg, double **res, long long *iw, double *w, int mem);
 int cgm_hs(const double **arg, double **res, long long *iw, double *w, int mem);
-
-#define MAX_COLUMNS 64
-#define STATE_LIMIT 1e6
-#define HALVINGS 5
-#define STABLE 2.5 /* step times rate of decay; the method's limit is 2.785 */
-#define EASY 0.03 /* of the tolerance: a step of fourth order twice as long errs 16 times as much */
 
 static int steps_of(double dt, double largest)
 {

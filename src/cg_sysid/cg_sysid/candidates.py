@@ -148,7 +148,7 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     Returns:
         The look, or a sentence saying why there is none.
     """
-    label, task = _label(task), _unbound(task)
+    label, task = _label(task), _as_cause(task)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
     if eventful(task) or late or not glimpse.lengths(train):
         return Look(label, task, np.nan)
@@ -164,10 +164,10 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     return Look(label, replace(task, leads=leads), leads[0].normalised_error)
 
 
-def _unbound(task: Task) -> Task:
-    """A small fault that is tried as a cause is no longer bound to be small.
+def _as_cause(task: Task) -> Task:
+    """What is tried as a cause is not bound to be small, as the same small fault would be.
 
-    Only the shape of its law is, where small faults are allowed for.
+    Only the shape of its law is bound, where small faults are allowed for.
     """
     if task.effect is None or not task.bounds:
         return task
@@ -183,7 +183,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     Returns:
         The outcome, or a sentence saying why there is none.
     """
-    label, task = _label(task), _unbound(task)
+    label, task = _label(task), _as_cause(task)
     try:
         best = _best_fit(task, train)
         known: Mapping[str, Mapping[str, float]] = {
