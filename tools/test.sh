@@ -6,8 +6,6 @@ set -uo pipefail
 cd "$(dirname "$0")/.."
 . tools/env.sh || exit 1
 export MPLBACKEND=Agg
-# Each package's tests on all cores; those that keep deadlines alone (conftest.py).
-export PYTEST_ADDOPTS="-n logical --dist worksteal ${PYTEST_ADDOPTS:-}"
 
 rm -f build/*/pytest.xml log/tests.txt
 colcon test ${1:+--packages-select "$@"}
