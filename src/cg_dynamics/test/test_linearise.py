@@ -32,7 +32,7 @@ def test_jacobians_agree_with_differences_under_every_effect(bare, name):
     model = bare.with_effect(name)
     compiled = compile_model(model, Setup())
     p = parameter_vector(model, Setup())
-    u = np.array([2.0, 0.7])[: compiled.nu]
+    u = np.array([2.0, 0.7, 1.1])[: compiled.nu]
     x = np.concatenate([[0.1, -0.2, 0.3, 0.35], np.zeros(compiled.nx - 4)])
     x[4:] = compiled.initial_state(x[:4], u, p)[4:]
     found = linearise(model, Setup(), x, u)
