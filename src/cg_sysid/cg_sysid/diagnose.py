@@ -53,7 +53,16 @@ from cg_sysid.diagnosis import (
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.identify import Fit
 from cg_sysid.imperfections import faults_among, imperfect, with_imperfections
-from cg_sysid.jury import COARSE_FIDELITY, EARNED, MATERIAL, Contest, Jury, at_noise, settled
+from cg_sysid.jury import (
+    COARSE_FIDELITY,
+    EARNED,
+    MATERIAL,
+    Contest,
+    Jury,
+    above_noise,
+    at_noise,
+    settled,
+)
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
@@ -62,6 +71,7 @@ from cg_sysid.record import Record
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
 from cg_sysid.unknowns import IdentificationError
+from cg_sysid.wandering import Wandering
 
 log = logging.getLogger(__name__)
 
@@ -581,6 +591,27 @@ class _Search:
         found = _small_faults(final)
         return [*found, self.instead] if found and self.instead else found
 
+    def _wandering(self, o: Outcome) -> Wandering | None:
+        """The number that differs from recording to recording, if one explains what is left."""
+        return what_wanders(
+            o, (*self.train, *self.held), self.options.effects, self.carry_out
+        )
+
+    def _less_mishaps(self, nominal: Outcome, final: Outcome) -> Outcome:
+        """Without what happened in single records, if a number that differs explains more.
+
+        A push in every record is many values, and takes the edge off whatever is wrong in each.
+        """
+        for label in sorted(self._added(final)):
+            if all(p.each != 'record' for p in final.model.effect(label).parameters):
+                continue
+            contest = self._without(nominal, final, label) if self._left(final) else None
+            wandering = self._wandering(contest.base) if contest else None
+            if contest and wandering:
+                unexplained = (1 - wandering.explained) * above_noise(contest.base)
+                final = contest.base if unexplained < above_noise(final) else final
+        return final
+
     def _conclude(self, nominal: Outcome, final: Outcome) -> Diagnosis:
         unmodelled = None
         if self._left(final):
@@ -588,13 +619,12 @@ class _Search:
                 nominal, final, self._added(final), self.train, self.held, self.carry_out
             )
             final = final if stand else nominal
+        final = self._less_mishaps(nominal, final)
         causes = self._causes(nominal, final)
         final = self._thorough(final)
         causes = [_as_in(final, cause) for cause in causes]
         left = self._left(final)
-        wandering = what_wanders(
-            final, (*self.train, *self.held), self.options.effects, self.carry_out
-        ) if left else None  # fmt: skip
+        wandering = self._wandering(final) if left else None
         if wandering and unmodelled and unmodelled.explained > wandering.explained:
             wandering = None  # the same for all records, and more
         if not causes:

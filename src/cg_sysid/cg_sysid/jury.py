@@ -176,7 +176,7 @@ class Jury:
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
                 f'judge {own:.0f} values of each record\'s own'
             )
-        left = _above_noise(o) / max(_above_noise(base), 1e-300)
+        left = above_noise(o) / max(above_noise(base), 1e-300)
         if eventful and not at_noise(o) and left > MISHAP:
             # A push in every record takes the edge off whatever is wrong all the time.
             reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
@@ -196,7 +196,8 @@ class Jury:
         )
 
 
-def _above_noise(o: Outcome) -> float:
+def above_noise(o: Outcome) -> float:
+    """chi2/N of all records less that of noise."""
     return chi2(o) / samples(o) - 1
 
 
