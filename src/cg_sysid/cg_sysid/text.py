@@ -47,7 +47,7 @@ def measured(value: float | None, sigma: float | None, unit: str = '1') -> str:
         return f'{number(value, 4)}{tail}'
     sigma *= factor
     if sigma <= 0:
-        return f'{number(value, 5)}{tail}'
+        return f'{value:.5g}{tail}'.replace('-', MINUS)  # known for certain
     decimals = 1 - math.floor(math.log10(sigma))
     if decimals < 0 or decimals > 7:
         return f'{number(value, 4)} \u00b1 {number(sigma, 2)}{tail}'
