@@ -164,6 +164,14 @@ def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
     return Look(label, replace(task, leads=leads), leads[0].normalised_error)
 
 
+def led_on(look: Look, task: Task) -> Look:
+    """The look for a task that has other small faults beside the same effect."""
+    task = _as_cause(task)
+    model = next(_starting_models(task))
+    leads = tuple(started_from(lead, model, task.bounds) for lead in look.task.leads)
+    return replace(look, task=replace(task, leads=leads))
+
+
 def _as_cause(task: Task) -> Task:
     """What is tried as a cause is not bound to be small, as the same small fault would be.
 

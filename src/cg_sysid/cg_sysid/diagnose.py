@@ -82,6 +82,7 @@ REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
+LEVEL = 1.0  # squared standard deviations within which two fits say the same of all data
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
@@ -307,17 +308,18 @@ class _Search:
             for e in effects
         ]
         title = f'other starts of {self._title(self._added(o))}'
+        near = SAME * o.train.normalised_error
         tasks = [
-            replace(look.task, leads=(lead,), iterations=RUNGS[0])
-            for look in self.race.look(without, title) for lead in look.task.leads
+            replace(look.task, leads=(lead,), iterations=RUNGS[0], reach=near)
+            for look in self.race.look_beside(without, title) for lead in look.task.leads
             if lead.normalised_error < FROM_AFAR * look.error
         ]  # fmt: skip
         found = self.race.fit(tasks, title)
-        near = SAME * o.train.normalised_error
         return [
             other for other in found
             if isinstance(other, Outcome) and other.train.normalised_error < near
             and not one_minimum(other.train, o.train, other.label)
+            and not _further_up(other.train, o.train)
         ]  # fmt: skip
 
     def _tie(self, contest: Contest, label: str) -> Contest | None:
@@ -658,6 +660,15 @@ class _Search:
             unmodelled=unmodelled,
             wandering=wandering,
         )  # fmt: skip
+
+
+def _further_up(other: Fit, found: Fit) -> bool:
+    """Whether a fit lies in a valley of the data with another, where the file believes less.
+
+    Fitted to its end it would come down along the valley to the other, slowly.
+    """
+    level = abs(other.squares - found.squares) < LEVEL
+    return level and other.belief >= found.belief
 
 
 def _structure(o: Outcome) -> Structure:

@@ -25,11 +25,13 @@ from cg_sysid.candidates import (
     cost_of,
     deeper,
     eventful,
+    led_on,
     look_at,
     try_candidate,
 )
 from cg_sysid.events import undisturbed
 from cg_sysid.identify import Fit
+from cg_sysid.imperfections import imperfect
 from cg_sysid.jury import samples
 from cg_sysid.trial import Trial
 
@@ -80,6 +82,21 @@ class Race:
                 log.info('%s: %s', task.effect, look)
         known = [self.looks[_structure(task)] for task in tasks]
         return [look for look in known if isinstance(look, Look)]
+
+    def look_beside(self, tasks: Sequence[Task], what: str) -> list[Look]:
+        """First looks, or what is known of the same effects beside other small faults."""
+        known = [look for task in tasks if (look := self._known_beside(task))]
+        effects = {look.task.effect for look in known}
+        return [*known, *self.look([t for t in tasks if t.effect not in effects], what)]
+
+    def _known_beside(self, task: Task) -> Look | None:
+        """A look at the same effect on the same causes, as one for this task."""
+        for look in self.looks.values():
+            if not isinstance(look, Look) or not look.task.leads:
+                continue
+            if look.task.effect == task.effect and _causes(look.task) == _causes(task):
+                return led_on(look, task)
+        return None
 
     def run(
         self, base: Task, effects: Effects, what: str, beaten: float = np.inf
@@ -198,6 +215,12 @@ def _structure(task: Task) -> tuple:
 def _of(base: Task) -> tuple:
     """What tells bases apart: their effects and small faults."""
     return frozenset(effect.label for effect in base.model.effects), frozenset(base.bounds)
+
+
+def _causes(base: Task) -> frozenset[str]:
+    """Labels of a base's effects, less small faults."""
+    labels = frozenset(effect.label for effect in base.model.effects)
+    return labels - imperfect(base.model, base.bounds)
 
 
 def _on_top(base: Task, effects: Effects) -> list[Task]:

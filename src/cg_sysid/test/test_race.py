@@ -17,6 +17,7 @@ from cg_sysid.candidates import (
 )
 from cg_sysid.events import undisturbed
 from cg_sysid.identify import fit
+from cg_sysid.imperfections import with_imperfections
 from cg_sysid.race import IDLE, Race, worth_having
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import pieces, prepare
@@ -113,6 +114,34 @@ def test_numbers_of_pieces_that_nothing_spoils(nominal):
 def test_what_is_wrong_all_the_time_did_not_happen(nominal, effects):
     bare = nominal.without_effect('coulomb_friction')
     assert undisturbed(bare, _trials(bare, _machine(bare, *effects)), {}) is None
+
+
+def test_a_look_serves_beside_other_small_faults_too(nominal):
+    """What every robot has a little of is let go when the cause is known: no need to look anew."""
+    train = _trials(nominal, _machine(nominal, ('payload', {'mass': 1.0})), seconds=5.0)
+    asked = []
+
+    def carry_out(function, arguments, what):
+        asked.append((what, len(arguments)))
+        return [function(*a) for a in arguments]
+
+    race = Race(train, train, carry_out)
+    model, bounds = with_imperfections(nominal, [trial.setup for trial in train])
+    faulty = Task(model, ('payload', None), bounds=bounds)
+    (look,) = race.look([faulty], 'beside small faults')
+    lean = Task(nominal, ('payload', None))
+    (same,) = race.look_beside([lean], 'alone')
+    assert asked == [('beside small faults', 1), ('alone', 0)]
+    assert same.task.model is nominal
+    own = {u.name for u in look.task.leads[0].unknowns}
+    assert own - {u.name for u in same.task.leads[0].unknowns} == set(bounds)
+    # It is a start for a fit of this structure, and a good one.
+    outcome = try_candidate(replace(same.task, iterations=8), train, train)
+    assert outcome.train.normalised_error == pytest.approx(1.0, abs=0.05)
+    # Another base is another matter.
+    other = Task(nominal.with_effect('torque_bias'), ('payload', None))
+    race.look_beside([other], 'on top of another cause')
+    assert asked[-1] == ('on top of another cause', 1)
 
 
 def test_an_event_is_sought_before_all_others_are_fitted(nominal):
