@@ -61,6 +61,7 @@ from cg_sysid.jury import (
     Jury,
     above_noise,
     at_noise,
+    explained_by,
     settled,
 )
 from cg_sysid.landing_cause import with_landings
@@ -250,9 +251,11 @@ class _Search:
         while len(self._added(o)) < self.options.rounds:
             plain, o = o, self._with_small_faults(o)
             winner = None
-            if not settled(o):
+            if not self._done(o):
                 contest = self._contest(o)
                 o, winner = contest.base, contest.winner()
+                if winner and self.jury.imitated(o) and not self._material(*winner):
+                    winner = None  # it may hide behind the small faults, but is small itself
                 self._note(contest, winner[0].label if winner else '')
             if winner is not None:
                 o = self._refitted(winner[1])
@@ -385,6 +388,9 @@ class _Search:
         plain, winner = contest.base, contest.winner()
         if winner is None:
             return plain if settled(plain) else None
+        equals = [winner[0], *contest.close_to(winner[0].label)]
+        if any(_is_small(candidate, faulty) for candidate in equals):
+            return None
         both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
         label = winner[0].label
@@ -398,6 +404,12 @@ class _Search:
             return None
         self._note(contest, label)
         return self._refitted(winner[1])
+
+    def _material(self, cause: Candidate, o: Outcome) -> bool:
+        """Whether a cause explains enough beside those small faults only that it leaves."""
+        lean = self._less_small_faults(o)
+        without = self._without_small_faults(lean, [cause.label])
+        return without is not None and explained_by(without, lean) >= MATERIAL
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
         """Without those small faults that, beside the causes, explain nothing any more."""
@@ -490,7 +502,7 @@ class _Search:
             )  # fmt: skip
             title = f'effects on top of {self._title(added)}'
             base, alone = self._led_deeper(base, effects, title)
-            outcomes, aside = ([], []) if settled(base) else self.race.run(
+            outcomes, aside = ([], []) if self._done(base) else self.race.run(
                 alone, effects, title, beaten
             )
             contest = self.jury.contest(base, outcomes)
@@ -503,7 +515,7 @@ class _Search:
         """A base, or the deeper minimum of it that effects on top of it showed; and its task."""
         alone = self._alone(base)
         for _ in range(DEEPER):
-            lead = None if settled(base) else self.race.lead_deeper(alone, effects, title)
+            lead = None if self._done(base) else self.race.lead_deeper(alone, effects, title)
             if lead is None:
                 break
             task = replace(alone, leads=(lead,), base=None)
@@ -514,6 +526,10 @@ class _Search:
             base = replace(deeper, label=base.label)
             alone = self._alone(base)
         return base, alone
+
+    def _done(self, o: Outcome) -> bool:
+        """Whether there is nothing to look for on top of this."""
+        return settled(o) and not self.jury.imitated(o)
 
     def _alone(self, base: Outcome) -> Task:
         """The task of a base by itself, with its fits."""
@@ -591,6 +607,11 @@ class _Search:
     def _small_faults(self, final: Outcome) -> list[str]:
         """What is there of small faults and what else would explain them, in words."""
         found = _small_faults(final)
+        if self.jury.imitated(final):
+            found.append(
+                f'what these leave is {1 + above_noise(final):.3f} times the noise and follows '
+                'something: a small cause may hide behind them'
+            )
         return [*found, self.instead] if found and self.instead else found
 
     def _wandering(self, o: Outcome) -> Wandering | None:
@@ -679,6 +700,14 @@ def _shown(o: Outcome) -> tuple[str, ...]:
     """Small faults that are there."""
     small = sorted(imperfect(o.model, o.task.bounds))
     return tuple(label for label in small if _shows(o, label))
+
+
+def _is_small(candidate: Candidate, faulty: Outcome) -> bool:
+    """True if what is tried as a cause is one of the small faults, and as small."""
+    return any(
+        abs(value) <= faulty.task.bounds.get(f'{candidate.label}.{name}', -np.inf)
+        for name, (value, *_) in candidate.parameters.items()
+    )
 
 
 def _shows(o: Outcome, label: str) -> bool:

@@ -20,6 +20,7 @@ from cg_sysid.candidates import (
 from cg_sysid.diagnosis import MARGIN, Candidate, contains, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.identify import Fit
+from cg_sysid.imperfections import faults_among
 from cg_sysid.trial import Trial
 
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
@@ -141,7 +142,7 @@ class Jury:
         fine = THOROUGH_FIDELITY if to_all else FIDELITY
         fidelity = fine if white else ROUGH_FIDELITY
         margin = max(MARGIN, fidelity * independent / 2)
-        if at_noise(base):
+        if at_noise(base) and not self.imitated(base):
             # Beliefs decide, and those are rough: whatever relieves them is a rival.
             margin = float('inf')
         return Contest(base, tuple(ranked), independent, margin)
@@ -152,20 +153,23 @@ class Jury:
         """One outcome against its base, `gained` nats of evidence better."""
         n = self.first_held
         significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
-        before = per_output(base.held)
-        after = per_output(o.held)
-        explained = float(np.sqrt(np.clip(before - after, 0, None)).max())
+        explained = explained_by(base, o)
         held_gain = 1 - o.held.normalised_error / base.held.normalised_error
         reasons = []
         if gained < EARNED:
             reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
-        if at_noise(base):
+        imitated = self.imitated(base)
+        if at_noise(base) and not imitated:
             # No error is left to explain, but numbers that nobody believes.
             if strained(o) or not at_noise(o):
                 reasons.append('leaves numbers far from what the model file believes')
         elif significance < SIGNIFICANT or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
-        elif explained < MATERIAL and not (strained(base) and not strained(o)):
+        elif (
+            explained < MATERIAL
+            and not (strained(base) and not strained(o))
+            and not (imitated and self._white(o))
+        ):
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
         own = _own_values(o) / len(self.steps)
@@ -194,6 +198,26 @@ class Jury:
             parameters=own_parameters(o),
             reason='; '.join(reasons),
         )
+
+    def imitated(self, o: Outcome) -> bool:
+        """True if small faults come to the noise, and what they leave is none.
+
+        Many together imitate much, but hardly down to white noise.
+        """
+        faulty = bool(faults_among(o.model, o.task.bounds))
+        return faulty and at_noise(o) and not self._white(o)
+
+    def _white(self, o: Outcome) -> bool:
+        return independent_samples(o.residuals, self.steps) > WHITE * samples(o)
+
+
+def explained_by(base: Outcome, o: Outcome) -> float:
+    """What an outcome explains of the base's error on held-out records, [sigma of the noise].
+
+    In the output in which it is most.
+    """
+    less = per_output(base.held) - per_output(o.held)
+    return float(np.sqrt(np.clip(less, 0, None)).max())
 
 
 def above_noise(o: Outcome) -> float:

@@ -91,6 +91,32 @@ def test_a_cause_is_named_among_small_faults(nominal, effect, values):
         assert abs(value - true) < 4 * sigma + 5e-3 * abs(true)
 
 
+def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
+    """Together they come to the noise, and no cause without them does."""
+    machine = nominal.with_effect('actuator_delay', delay=0.001)
+    found = diagnose(nominal, _records(machine.with_effect('torque_bias', bias=0.03)),
+                     Options(effects=EFFECTS, workers=1))  # fmt: skip
+    assert [(cause.label, cause.rivals) for cause in found.causes] == [('torque_bias', ())]
+    value, sigma, _ = found.causes[0].parameters['bias']
+    assert abs(value - 0.03) < 4 * sigma < 0.01
+    # What is left of the small faults is what was there.
+    identified = found.extended.train.model.values
+    assert identified['actuator_delay.delay'] == pytest.approx(0.001, rel=0.05)
+    assert identified.get('imu_offset.offset', 0.0) == pytest.approx(0.0, abs=2e-4)
+
+
+def test_what_hides_behind_small_faults_and_is_small_itself_is_no_cause(nominal):
+    machine = nominal.with_effect('actuator_delay', delay=0.001)
+    machine = machine.with_effect('quadratic_friction', coefficient=0.006)
+    found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
+    # Nor is the delay, or a lag that looks like it: that small it is a small fault.
+    assert (found.verdict, found.causes) == ('consistent', ())
+    # It is earned, and explains less than the noise even where no small fault helps.
+    candidates = [c for r in found.rounds for c in r.candidates]
+    assert any(c.label == 'quadratic_friction' and not c.reason for c in candidates)
+    assert any('a small cause may hide behind them' in line for line in found.findings)
+
+
 PULLED = ('tether_force', 'torque_bias', 'encoder_offset', 'quadratic_friction')
 
 
