@@ -60,10 +60,13 @@ def characterise(
     length, terms = sketch(lasting, train, held)
     if not terms:
         return None
-    shared = [term for term in terms if term.effect.kind != 'vibrating']
-    if shared and terms[0].error > OWN_PHASES * shared[0].error:
-        return _smooth_or_periodic(base, lasting, shared, WINDOW * length, (train, held), run)
-    return _vibrating(base, terms[0], (train, held), run)
+    shared = [term for term in terms if term.effect.kind != 'vibrating'][:FINALISTS]
+    found = None
+    if not shared or terms[0].error < OWN_PHASES * shared[0].error:
+        found = _vibrating(base, terms[0], (train, held), run)
+    if found is None and shared:
+        found = _smooth_or_periodic(base, lasting, shared, WINDOW * length, (train, held), run)
+    return found
 
 
 def what_remains(
@@ -132,7 +135,7 @@ def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[f
     if not found:
         return pieces.length, []
     most = 1 + WORTH_FITTING * max(found[0].error - 1, 0.05)
-    return pieces.length, [term for term in found if term.error < most][:FINALISTS]
+    return pieces.length, [term for term in found if term.error < most]
 
 
 def _lasting(base: Outcome) -> Task:

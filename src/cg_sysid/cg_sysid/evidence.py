@@ -19,6 +19,7 @@ import numpy as np
 
 TIE = 0.02  # change of chi2/N of a block below which it does not vote
 MIN_BLOCKS = 6  # fewer voters decide nothing
+CORRELATION_S = 0.2  # of model error: the order of a motion's own
 LONGEST_LAG = 1.0  # s; correlation beyond is motion of the whole record, not memory
 
 
@@ -44,6 +45,21 @@ def correlation_time(residual: np.ndarray, step: float) -> float:
     below = np.flatnonzero(rho[1 : last + 1] < 2 / np.sqrt(n))
     stop = int(below[0]) if len(below) else last
     return float(1 + 2 * rho[1 : stop + 1].sum())
+
+
+def weight_of(excess: np.ndarray, step: float) -> np.ndarray:
+    """What a sample says beside what the model file believes, where the noise alone would say 1.
+
+    Residuals far above the noise are model error: correlated over many samples, so that each says
+    much less than white noise of that size would.
+
+    Args:
+        excess: Mean squared residual over noise variance, any shape.
+        step: Sampling interval in s.
+    """
+    excess = np.maximum(1.0, excess)
+    together = max(1.0, CORRELATION_S / step)
+    return 1 / (excess * (1 + (together - 1) * (1 - 1 / excess)))
 
 
 def independent_samples(residuals: Sequence[np.ndarray], steps: Sequence[float]) -> float:

@@ -21,6 +21,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
+from cg_sysid.evidence import weight_of
 from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, moved, own_values, reduced
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
@@ -29,7 +30,6 @@ from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknow
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
-CORRELATION_S = 0.2  # of model error: the order of a motion's own
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
@@ -390,12 +390,8 @@ def _unseen(
 
 
 def _weight(problem: Problem, point: Point) -> float:
-    # Residuals far above the noise are model error: correlated over many samples, so that each
-    # says much less than white noise of that size would.
-    excess = max(1.0, point.sse.sum() / point.count.sum())
     step = np.median(np.concatenate([np.diff(trial.time) for trial in problem.trials]))
-    together = max(1.0, CORRELATION_S / step)
-    return 1 / (excess * (1 + (together - 1) * (1 - 1 / excess)))
+    return float(weight_of(point.sse.sum() / point.count.sum(), step))
 
 
 def _as_waves_are_written(

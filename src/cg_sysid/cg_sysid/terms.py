@@ -20,7 +20,8 @@ import numpy as np
 from cg_dynamics.effects import UNMODELLED
 from cg_dynamics.effects.unmodelled import COSINES, JointTerm, LearnedEffect, SensorTerm
 from cg_dynamics.model import Model
-from cg_sysid.response import Piece, Pieces
+from cg_sysid.evidence import weight_of
+from cg_sysid.response import SAMPLES_HZ, Piece, Pieces
 from cg_sysid.trial import Trial
 
 BEYOND = 0.05  # share of the range of data by which a smooth function goes beyond them
@@ -357,7 +358,7 @@ class Sketches:
             for _ in range(3):
                 # The weight of the data follows what is left, as in the identification.
                 left = self._left(h, g, x, learn) / max(self.samples[learn], 1)
-                weight = 1 / np.maximum(1.0, left)
+                weight = weight_of(left, 1 / SAMPLES_HZ)
                 a = weight[:, None, None] * h[learn] + _diagonal(precision)
                 scale = np.sqrt(np.maximum(np.einsum('bii->bi', a), 1e-300))
                 a = a / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(a.shape[1])
@@ -378,7 +379,7 @@ class Sketches:
             b = (weight * g + pull) / scale
             x = np.linalg.lstsq(a / np.outer(scale, scale), b, rcond=1e-12)[0] / scale
             left = sum(self.squares.values()) + x @ h @ x - 2 * g @ x
-            weight = 1 / max(1.0, left / samples)
+            weight = float(weight_of(left / samples, 1 / SAMPLES_HZ))
         return x
 
     def _left(self, h: Fold, g: Fold, x: np.ndarray, side: bool) -> np.ndarray:

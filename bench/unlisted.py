@@ -1,0 +1,65 @@
+"""What a diagnosis says of machines with a law that no library has, when it may try everything.
+
+    ./cg exec python bench/unlisted.py [--first 0] [--laws a,b] [--workers N] [--write FILE]
+
+The laws and the machines are those of cg_sysid/test/unlisted.py: four records of 6 s on springs.
+There the diagnosis may try what comes nearest; here it has the whole library, any two or three
+effects of which could together pass for the law. *Right* is `unexplained`, with the law at its
+place and as a function of its variable.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from cg_bringup.runs import NOMINAL_MODEL
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
+
+sys.path.insert(0, str(Path(__file__).parents[1] / 'src/cg_sysid/test'))
+from unlisted import CASES, hide, records
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--first', type=int, default=0, help='of the records')
+    parser.add_argument('--laws', help='comma-separated')
+    parser.add_argument('--workers', type=int)
+    parser.add_argument('--write', type=Path)
+    options = parser.parse_args()
+    wanted = options.laws.split(',') if options.laws else [case.hidden.name for case in CASES]
+    nominal = Model.load(model_path(NOMINAL_MODEL))
+    lines = [
+        '# Laws that no library has', '',
+        f'Command: `./cg exec python bench/unlisted.py --first {options.first}`', '',
+        '| law | verdict | causes | described as | explained | right | s |',
+        '|---|---|---|---|---:|---|---:|',
+    ]  # fmt: skip
+    for case in CASES:
+        if case.hidden.name not in wanted:
+            continue
+        began = time.monotonic()
+        machine = hide(nominal, case.hidden)
+        answer = diagnose(
+            nominal, records(machine, options.first), Options(workers=options.workers)
+        )
+        found = answer.unmodelled
+        right = answer.verdict == 'unexplained' and found is not None and (
+            (found.where, found.effect.follows) == (case.where, case.follows)
+        )
+        lines.append(
+            f'| {case.hidden.name.removeprefix("hidden_")} | {answer.verdict} '
+            f'| {", ".join(cause.label for cause in answer.causes)} '
+            f'| {found.label if found else ""} | {100 * found.explained if found else 0:.1f} % '
+            f'| {"yes" if right else "**no**"} | {time.monotonic() - began:.0f} |'
+        )
+        print(lines[-1], flush=True)
+    if options.write:
+        options.write.write_text('\n'.join(lines) + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
