@@ -252,10 +252,8 @@ class _Search:
             plain, o = o, self._with_small_faults(o)
             winner = None
             if not self._done(o):
-                contest = self._contest(o)
+                contest = self._of_size(self._contest(o))
                 o, winner = contest.base, contest.winner()
-                if winner and self.jury.imitated(o) and not self._material(*winner):
-                    winner = None  # it may hide behind the small faults, but is small itself
                 self._note(contest, winner[0].label if winner else '')
             if winner is not None:
                 o = self._refitted(winner[1])
@@ -405,11 +403,23 @@ class _Search:
         self._note(contest, label)
         return self._refitted(winner[1])
 
-    def _material(self, cause: Candidate, o: Outcome) -> bool:
-        """Whether a cause explains enough beside those small faults only that it leaves."""
-        lean = self._less_small_faults(o)
-        without = self._without_small_faults(lean, [cause.label])
-        return without is not None and explained_by(without, lean) >= MATERIAL
+    def _of_size(self, contest: Contest) -> Contest:
+        """Without winners that hide behind small faults, but are small themselves.
+
+        What a cause explains is asked beside those small faults only that it does not make idle.
+        """
+        while self.jury.imitated(contest.base) and (winner := contest.winner()):
+            label = winner[0].label
+            lean = self._less_small_faults(winner[1])
+            without = self._without_small_faults(lean, [label])
+            explained = explained_by(without, lean) if without else 0.0
+            if explained >= MATERIAL:
+                break
+            contest = contest.less(
+                label, f'explains {explained:.2f} noise standard deviations where no small fault '
+                f'does, {MATERIAL:g} needed'
+            )  # fmt: skip
+        return contest
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
         """Without those small faults that, beside the causes, explain nothing any more."""

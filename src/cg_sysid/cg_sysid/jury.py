@@ -4,7 +4,7 @@ The conditions and why they are what they are: docs/diagnosis.md, section 4.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,12 @@ class Contest:
             and pair[0].evidence > leader.evidence - self.margin
         ]
         return simpler[0] if simpler else able[0]
+
+    def less(self, label: str, reason: str) -> 'Contest':
+        """The contest with the candidate of that label turned down after all."""
+        return replace(self, ranked=tuple(
+            (replace(c, reason=reason) if c.label == label else c, o) for c, o in self.ranked
+        ))  # fmt: skip
 
     def of(self, label: str) -> tuple[Candidate, Outcome] | None:
         """The candidate of that label."""
