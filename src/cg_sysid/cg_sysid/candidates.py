@@ -570,9 +570,25 @@ def too_small(o: Outcome) -> list[str]:
     if first.neutral is None or not np.isfinite(first.neutral) or first.each:
         return []
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
-    if abs(value - first.neutral) > TOO_SMALL * sigma:
+    # Within their bounds small faults may take any part of it: that says nothing of its size.
+    beside = _sigma_beside(o.train, f'{o.label}.{first.name}', o.task.bounds)
+    if abs(value - first.neutral) > TOO_SMALL * min(sigma, beside):
         return []
     return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
+
+
+def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
+    """Standard deviation of a value, were the values of these names known."""
+    names = [u.name for u in found.unknowns]
+    if name not in names:
+        return np.inf
+    at, known = names.index(name), [names.index(n) for n in given if n in names]
+    among, across = found.covariance[np.ix_(known, known)], found.covariance[at, known]
+    if not known or not np.isfinite(among).all() or not np.isfinite(across).all():
+        return float(found.sigmas[at])
+    variance = found.covariance[at, at] - across @ np.linalg.pinv(among) @ across
+    factor = abs(found.values[at]) if found.unknowns[at].logarithmic else 1.0
+    return factor * float(np.sqrt(max(variance, 0.0)))
 
 
 def at_edge(o: Outcome) -> list[str]:

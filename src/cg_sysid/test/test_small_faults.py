@@ -134,6 +134,19 @@ def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
     assert found.causes[0].proposals[0].evidence > 20
 
 
+def test_what_small_faults_take_a_part_of_is_not_small_itself(nominal):
+    """Of a tether two springs may be any part that their bounds allow: its force is uncertain."""
+    records = _records(nominal.with_effect('tether_force', force=5.0))
+    options = Options(effects=(*PULLED, 'spring_stiffness'), workers=1)
+    found = diagnose(nominal, records, options)
+    assert found.verdict == 'ambiguous'
+    (cause,) = found.causes
+    assert 'tether_force' in (cause.label, *cause.rivals)
+    assert {label.partition('@')[0] for label in (cause.label, *cause.rivals)} == {
+        'tether_force', 'spring_stiffness',
+    }  # fmt: skip
+
+
 def test_springs_that_do_not_conspire_are_no_tether(nominal):
     left, right = _springs(200.0).springs
     uneven = replace(left, stiffness=202.0), replace(right, stiffness=198.6)
