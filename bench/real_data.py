@@ -26,6 +26,7 @@ from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.identify import fit, predict, score
 from cg_sysid.importing import import_to_bags
+from cg_sysid.text import measured
 from cg_sysid.trial import prepare
 
 
@@ -148,7 +149,7 @@ def run(study, data, bags, workers):
     lines += ['', '| cause | parameters | evidence, nats | could also be |', '|---|---|---|---|']
     for cause in found.causes:
         numbers = ', '.join(
-            f'{name} {value:.4g} ± {sigma:.2g} {unit}'
+            f'{name} {measured(value, sigma, unit)}'
             for name, (value, sigma, unit) in cause.parameters.items()
         )
         lines.append(

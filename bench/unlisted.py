@@ -30,7 +30,10 @@ def main():
     parser.add_argument('--workers', type=int)
     parser.add_argument('--write', type=Path)
     options = parser.parse_args()
-    wanted = options.laws.split(',') if options.laws else [case.hidden.name for case in CASES]
+    cases = {case.hidden.name.removeprefix('hidden_'): case for case in CASES}
+    wanted = options.laws.split(',') if options.laws else list(cases)
+    if unknown := set(wanted) - set(cases):
+        parser.error(f'no law {", ".join(sorted(unknown))} here; there are {", ".join(cases)}')
     nominal = Model.load(model_path(NOMINAL_MODEL))
     lines = [
         '# Laws that no library has', '',
@@ -38,10 +41,8 @@ def main():
         '| law | verdict | causes | described as | explained | right | s |',
         '|---|---|---|---|---:|---|---:|',
     ]  # fmt: skip
-    for case in CASES:
-        if case.hidden.name not in wanted:
-            continue
-        began = time.monotonic()
+    for name in wanted:
+        case, began = cases[name], time.monotonic()
         machine = hide(nominal, case.hidden)
         answer = diagnose(
             nominal, records(machine, options.first), Options(workers=options.workers)
@@ -51,7 +52,7 @@ def main():
             (found.where, found.effect.follows) == (case.where, case.follows)
         )
         lines.append(
-            f'| {case.hidden.name.removeprefix("hidden_")} | {answer.verdict} '
+            f'| {name} | {answer.verdict} '
             f'| {", ".join(cause.label for cause in answer.causes)} '
             f'| {found.label if found else ""} | {100 * found.explained if found else 0:.1f} % '
             f'| {"yes" if right else "**no**"} | {time.monotonic() - began:.0f} |'
