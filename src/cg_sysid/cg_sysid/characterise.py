@@ -19,7 +19,7 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.candidates import Outcome, Task, chi2, try_candidate
 from cg_sysid.identify import Fit, fit, in_trial, score
-from cg_sysid.jury import Contest, Jury
+from cg_sysid.jury import Contest, Jury, share_explained
 from cg_sysid.response import cut, pieces_of, simulated_signals
 from cg_sysid.shape import GRID, function_of, shape_of
 from cg_sysid.terms import BEYOND, Sketches, Term
@@ -293,9 +293,9 @@ def _unmodelled(
         evidence=best.evidence,
         significance=best.significance,
         explained=(
-            _explained(before, fits[1])
+            share_explained(before, fits[1])
             if fits[1] is not None
-            else _explained(contest.base.held, found.held)
+            else share_explained(contest.base.held, found.held)
         ),
         window=window,
         rivals=tuple(
@@ -306,11 +306,6 @@ def _unmodelled(
         fit=fits[0],
         held=fits[1],
     )
-
-
-def _explained(before: Fit, after: Fit) -> float:
-    gone = before.normalised_error - after.normalised_error
-    return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
 
 
 def _period(effect: LearnedEffect, found: Fit) -> tuple[float, float] | None:

@@ -63,6 +63,7 @@ from cg_sysid.jury import (
     at_noise,
     explained_by,
     settled,
+    share_explained,
 )
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.parallel import run_all
@@ -82,6 +83,7 @@ DEEPER = 3  # times that a base is asked for deeper minima
 REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
+ACCOUNTS = 0.5  # of the squared error above the noise: causes that take less do not explain it
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 LEVEL = 1.0  # squared standard deviations within which two fits say the same of all data
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
@@ -660,8 +662,11 @@ class _Search:
         wandering = self._wandering(final) if left else None
         if wandering and unmodelled and unmodelled.explained > wandering.explained:
             wandering = None  # the same for all records, and more
+        share = share_explained(nominal.held, final.held)
         if not causes:
             verdict = 'unexplained' if left else 'consistent'
+        elif left and share < ACCOUNTS:
+            verdict = 'unexplained'
         elif any(cause.rivals for cause in causes):
             verdict = 'ambiguous'
         else:
@@ -673,7 +678,7 @@ class _Search:
             verdict=verdict,
             summary=summary_of(
                 verdict, causes, gains, left, tuple(strained(nominal)), unmodelled,
-                self.options.effects, wandering,
+                self.options.effects, wandering, share,
             ),
             causes=tuple(causes),
             gains=gains,

@@ -15,6 +15,7 @@ from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
+from cg_sysid.text import listed
 from cg_sysid.trial import Trial
 from cg_sysid.unmodelled import NOTHING, Unmodelled
 from cg_sysid.wandering import Wandering
@@ -125,7 +126,7 @@ class Diagnosis:
     Attributes:
         verdict: consistent, explained, ambiguous, unexplained or unusable.
         summary: One sentence for people.
-        causes: Named causes, strongest first.
+        causes: Named causes, strongest first; those of `unexplained` leave most of the error.
         gains: Simulation error before and after on held-out records.
         nominal: The model as it was given.
         baseline: The same, its parameters identified on the training records.
@@ -218,6 +219,7 @@ def summary_of(
     unmodelled: Unmodelled | None = None,
     tried: Sequence[str] | None = None,
     wandering: Wandering | None = None,
+    explained: float = 1.0,
 ) -> str:
     """The answer in a few sentences.
 
@@ -230,6 +232,7 @@ def summary_of(
         unmodelled: What is left, as a learned term.
         tried: Effects that were tried; None for the whole library.
         wandering: A number that differs from recording to recording.
+        explained: Share of the squared error above the noise that the causes take.
     """
     if verdict == 'consistent':
         text = 'The model explains the records down to the noise of the sensors'
@@ -240,11 +243,18 @@ def summary_of(
     if verdict == 'unexplained':
         known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
         whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
-        return (
+        text = (
             f'Something is missing that no effect {whose} explains: {biggest.channel} is '
             f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
             f'{biggest.noise:.2g}. {known or NOTHING}'
         )
+        if causes:
+            text += (
+                f' No more than {100 * explained:.0f} % of the squared error on held-out records '
+                f'goes with {listed([described(c) for c in causes])}, which may only stand in '
+                'for what is missing.'
+            )
+        return text
     named = ', '.join(described(c) for c in causes)
     if biggest.before < NO_GAIN * biggest.after and strained:
         text = (

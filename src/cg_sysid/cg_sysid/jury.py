@@ -226,6 +226,12 @@ def explained_by(base: Outcome, o: Outcome) -> float:
     return float(np.sqrt(np.clip(less, 0, None)).max())
 
 
+def share_explained(before: Fit, after: Fit) -> float:
+    """Share of the squared error above the noise that is gone, 0 to 1."""
+    gone = before.normalised_error - after.normalised_error
+    return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
+
+
 def above_noise(o: Outcome) -> float:
     """chi2/N of all records less that of noise."""
     return chi2(o) / samples(o) - 1

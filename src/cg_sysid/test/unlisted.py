@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.effects.effect import TIME, Effect
+from cg_dynamics.effects.effect import TIME, Effect, reading_rate
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.rehearse import rehearse
@@ -17,6 +17,7 @@ from cg_sysid.rehearse import rehearse
 SAMPLE = 0.004
 DURATION = 6.0
 PITCH = 0.21  # rad, of the detent
+TOOTH = 0.15  # rad
 HERTZ = 3.7
 
 
@@ -173,6 +174,97 @@ class TiltedGyro(BentImu):
         return {**outputs, 'imu_rate': pulled}, []
 
 
+class StiffeningSpring(DetentTorque):
+    """A rubber band across the hip that hardly pulls at first."""
+
+    name = 'hidden_stiffening_spring'
+
+    @staticmethod
+    def function(s):
+        return -60.0 * s**3
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -60.0 * angle**3, []
+
+
+class LopsidedDrive(DeadZone):
+    """A drive that gives a sixth more one way and a sixth less the other way."""
+
+    name = 'hidden_lopsided_drive'
+
+    @staticmethod
+    def function(s):
+        return 0.15 * np.abs(s)
+
+    def deliver(self, torque, z, p):
+        return torque * (1 + 0.15 * ca.tanh(torque / 0.02)), []
+
+
+class TorqueRipple(DetentTorque):
+    """A gear whose teeth take a part of the torque, tooth by tooth."""
+
+    name = 'hidden_torque_ripple'
+
+    @staticmethod
+    def function(s):
+        return -0.2 * np.sin(2 * np.pi * s / TOOTH)
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -0.2 * ca.sin(2 * math.pi * angle / TOOTH) * load, []
+
+
+class SlowMotor(DetentTorque):
+    """A motor that pulls less, the faster it turns."""
+
+    name = 'hidden_slow_motor'
+
+    @staticmethod
+    def function(s):
+        return -0.12 * np.sqrt(s**2 + 1e-4)
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -0.12 * ca.sqrt(rate**2 + 1e-4) * load, []
+
+
+class HangingEncoder(BentImu):
+    """An encoder that hangs behind by a fixed angle, whichever way it turns."""
+
+    name = 'hidden_hanging_encoder'
+
+    @staticmethod
+    def function(s):
+        return -0.0015 * np.tanh(s / 0.02)
+
+    def read(self, outputs, z, p):
+        behind = 0.0015 * ca.tanh(p[reading_rate('hip_angle')] / 0.02)
+        return {**outputs, 'hip_angle': outputs['hip_angle'] - behind}, []
+
+
+class Gust(DetentTorque):
+    """A gust against the inner legs."""
+
+    name, place, extra_inputs = 'hidden_gust', 'environment', (TIME,)
+
+    @staticmethod
+    def function(s):
+        return 0.8 * np.exp(-(((s - 3) / 0.8) ** 2))
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return ca.SX(0), []
+
+    def force(self, body, p):
+        return ca.vertcat(0.8 * ca.exp(-(((p[TIME] - 3) / 0.8) ** 2)), 0)
+
+
+class ViscoelasticHip(DetentTorque):
+    """Rubber in the hip that gives way within a third of a second: a law with a memory."""
+
+    name, states = 'hidden_viscoelastic_hip', ('stretch',)
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -8.0 * z[0], [rate - z[0] / 0.3]
+
+
 @dataclass(frozen=True)
 class Case:
     """What is hidden, what may be tried, and what has to be said."""
@@ -212,6 +304,19 @@ CASES = (
          'unmodelled_rate_error_of_angle', 'sensor', 'angle:imu_angle', 'odd'),
     Case(FadingMotor, ('torque_constant', 'friction_drift'),
          'unmodelled_torque_gain_of_time', 'torque path', 'time'),
+)  # fmt: skip
+# Too many for tests: bench/unlisted.py has them as well.
+MORE = (
+    Case(StiffeningSpring, (), 'unmodelled_joint_torque_of_angle', 'joint', 'angle:hip', 'odd'),
+    Case(LopsidedDrive, (), 'unmodelled_joint_torque_of_torque', 'torque path', 'torque:hip',
+         'even'),
+    Case(TorqueRipple, (), 'unmodelled_torque_gain_periodic_in_angle', 'torque path', 'angle:hip',
+         'odd', TOOTH),
+    Case(SlowMotor, (), 'unmodelled_torque_gain_of_rate', 'torque path', 'rate:hip', 'even'),
+    Case(HangingEncoder, (), 'unmodelled_angle_error_of_rate', 'sensor', 'rate:hip_angle', 'odd'),
+    Case(Gust, (), 'unmodelled_outer_torque_of_time', 'outside', 'time'),
+    # No function of one variable describes it.
+    Case(ViscoelasticHip, ('torque_constant', 'torque_bias'), '', '', ''),
 )  # fmt: skip
 
 

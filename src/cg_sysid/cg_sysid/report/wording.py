@@ -92,6 +92,9 @@ def lead(facts: Facts) -> str:
     )
     if facts.get('unmodelled'):
         text += ' A learned function describes it.'
+    if facts['causes']:
+        names = listed([effect_name(c['label']) for c in facts['causes']])
+        text += f' Most of it stays with {names}, which may only stand in for what is missing.'
     return text
 
 
