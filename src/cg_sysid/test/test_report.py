@@ -83,6 +83,18 @@ def test_what_is_not_determined_is_said_beside_the_cause(facts, lines):
     assert said in render(made, lines)
 
 
+def test_causes_that_explain_little_are_not_called_the_cause(facts, lines):
+    said = 'takes less than half of the error, and may only stand in'
+    assert said not in render(with_verdict(facts, 'unexplained'), lines)
+    made = with_verdict(facts, 'explained')
+    assert said not in render(made, lines)
+    made['verdict'] = 'unexplained'
+    made['provenance']['options'] = {'effects': 'torque_bias,payload@outer'}
+    page = render(made, lines)
+    assert said in page
+    assert 'no effect tried (torque bias or payload (outer)) explains' in page
+
+
 def test_the_page_fetches_nothing(facts, lines):
     page = render(facts, lines)
     parser = outline(page)

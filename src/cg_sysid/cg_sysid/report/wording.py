@@ -3,7 +3,7 @@
 from typing import Any
 
 from cg_sysid.leftover import followed
-from cg_sysid.text import effect_name, listed, measured, number, scaled
+from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
 
 Facts = dict[str, Any]
 
@@ -93,14 +93,19 @@ def lead(facts: Facts) -> str:
     if facts.get('unmodelled'):
         text += ' A learned function describes it.'
     if facts['causes']:
-        names = listed([effect_name(c['label']) for c in facts['causes']])
-        text += f' Most of it stays with {names}, which may only stand in for what is missing.'
+        names = [effect_name(c['label']) for c in facts['causes']]
+        text += (
+            f' {sentence(listed(names))} {"takes" if len(names) == 1 else "take"} less than half '
+            'of the error, and may only stand in for what is missing.'
+        )
     return text
 
 
 def _nothing_tried(facts: Facts) -> str:
     tried = facts['provenance'].get('options', {}).get('effects', 'all')
-    return 'no known effect' if tried == 'all' else f'no effect tried ({tried})'
+    if tried == 'all':
+        return 'no known effect'
+    return f'no effect tried ({listed([effect_name(label) for label in tried.split(",")], "or")})'
 
 
 def left_words(facts: Facts) -> dict[str, str]:
