@@ -12,6 +12,7 @@ from cg_sysid.diagnosis_file import VERDICTS
 from cg_sysid.report import render
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.signals import MISSING, STEPS, quantised, spectra
+from cg_sysid.report.wording import headline, lead
 
 HOSTILE = '</script><script>alert(1)</script><b a="'
 VOID = {'br', 'col', 'hr', 'input', 'meta'}
@@ -93,6 +94,16 @@ def test_causes_that_explain_little_are_not_called_the_cause(facts, lines):
     page = render(made, lines)
     assert said in page
     assert 'no effect tried (torque bias or payload (outer)) explains' in page
+
+
+def test_a_learned_term_of_little_makes_no_headline(facts):
+    made = with_verdict(facts, 'unexplained')
+    made['unmodelled'] = {'what': 'a torque at the hip', 'explained': 0.96}
+    assert headline(made) == 'The simulation lacks a torque at the hip'
+    assert 'A learned function describes it.' in lead(made)
+    made['unmodelled']['explained'] = 0.044
+    assert headline(made).startswith('There is an error in')
+    assert 'A learned function describes 4.4 % of it.' in lead(made)
 
 
 def test_the_page_fetches_nothing(facts, lines):

@@ -15,6 +15,7 @@ VERDICTS = {
     'unusable': 'The recordings themselves are broken.',
     'identified': 'Parameters of the model as given, fitted to the recordings.',
 }
+MAINLY = 0.5  # of the squared error: a learned term that takes less makes no headline
 MOST_EVENTS = 12  # values of single recordings that are listed
 ABOVE_NOISE = 2.0  # multiples of the sensor noise from which an error is spoken of
 HINTS = {
@@ -41,8 +42,9 @@ def headline(facts: Facts) -> str:
         ]
         return f'The simulation lacks {"; and ".join(parts)}'
     if verdict == 'unexplained':
-        if facts.get('unmodelled'):
-            return f'The simulation lacks {facts["unmodelled"]["what"]}'
+        term = facts.get('unmodelled')
+        if term and term['explained'] >= MAINLY:
+            return f'The simulation lacks {term["what"]}'
         if facts.get('wandering'):
             return f'From recording to recording {facts["wandering"]["name"]} differs'
         worst = worst_channel(facts)
@@ -90,8 +92,9 @@ def lead(facts: Facts) -> str:
         f'The simulation misses {channel} by {left} on held-out recordings, and '
         f'{_nothing_tried(facts)} explains that.'
     )
-    if facts.get('unmodelled'):
-        text += ' A learned function describes it.'
+    if term := facts.get('unmodelled'):
+        share = f'{number(100 * term["explained"], 2)} % of '
+        text += f' A learned function describes {share * (term["explained"] < MAINLY)}it.'
     if facts['causes']:
         names = [effect_name(c['label']) for c in facts['causes']]
         text += (
