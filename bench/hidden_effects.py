@@ -60,6 +60,12 @@ SECONDS = 8.0
 THE_SAME = ({'actuator_delay', 'sensor_delay'},)
 UNTOLD = 6.0  # nats: what differs by less, all records together, is not told apart
 SPRING_ERROR = 0.01  # relative, of all springs, among small faults
+# Hidden here besides what the demonstration hides, alone and after all others: the seeds and the
+# pairs of earlier sweeps stay what they were.
+ALSO = {
+    'boom_mass': {'weight': [0.3, 1.0], 'signed': ['weight']},  # kg
+    'rotor_inertia': {'inertia': [0.05, 0.2]},  # kg m^2
+}
 SHARE = 3.0  # of the noise: causes that explain less are not counted as hidden
 
 
@@ -95,7 +101,7 @@ def with_small_faults(machine):
 
 def hide(nominal, effects, size, seed):
     """Nominal model, machine and the hidden values; effects of the model are left out of it."""
-    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
+    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8')) | ALSO
     rng = np.random.default_rng(seed)
     machine, values = perturb(nominal, rng)[0], {}
     for name in effects:
@@ -289,7 +295,7 @@ def cases_of(options, known):
                 pair = tuple(str(x) for x in rng.choice(known, 2, replace=False))
                 yield pair, float(rng.choice(sizes)), options.first + 1000 * k + j, options.faults
             continue
-        for j, name in enumerate(('none', *known)):
+        for j, name in enumerate(('none', *known, *ALSO)):
             effects = () if name == 'none' else (name,)
             yield effects, float(rng.choice(sizes)), options.first + 1000 * k + j, options.faults
 
