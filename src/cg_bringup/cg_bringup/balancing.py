@@ -86,7 +86,7 @@ def balance(
         now = measurement.time_ns
         estimate = estimator.step(now, torque, measurement.outputs, stance)
         command = controller.step(now, estimate.stance, estimate.x)
-        gate.offer([command.torque], now)
+        gate.offer([command.torque], now, now)
         (torque,) = gate.torque(now).torque
         rows.append(
             (now * 1e-9, plant.state, estimate.x, torque, measurement.outputs, controller.mode)

@@ -12,12 +12,11 @@ import yaml
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_hardware.topics import TORQUE_FRAME, joints_of
+from cg_hardware.topics import MEASUREMENT, TORQUE_FRAME, joints_of
 from cg_sysid.experiments import Experiment, ExperimentError
 
 MODES = ('lockstep', 'real_time')
 NOMINAL_MODEL = 'compass_gait_mit'
-MEASUREMENT_TOPIC = {'compass_gait': '/imu'}
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def node_parameters(run: Run) -> dict[str, dict[str, Any]]:
             **experiment.excitation,
             'duration': run.length,
             'seed': run.seed,
-            'measurement_topic': MEASUREMENT_TOPIC.get(mechanism, '/joint_states'),
+            'measurement_topic': MEASUREMENT[mechanism],
             'joints': list(joints_of(mechanism)),
             'frame_id': TORQUE_FRAME[mechanism],
             'listeners': 2,

@@ -161,6 +161,24 @@ def to_nanoseconds(stamp: Time) -> int:
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
+class Throttled:
+    """A way to the log that takes a message at most once in so many s.
+
+    The logger's own throttle looks for its caller in the stack first, which takes 0.5 ms each
+    time, a quarter of a sample.
+    """
+
+    def __init__(self, log: Callable[[str], Any], period: float = 1.0):
+        self._log, self._period, self._next = log, period, 0.0
+
+    def __call__(self, message: str) -> None:
+        """Log the message, or let it go."""
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + self._period
+            self._log(message)
+
+
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     """Make a node and spin it until SIGINT, SIGTERM or its own `finished`.
 

@@ -18,7 +18,14 @@ from sensor_msgs.msg import Imu, JointState
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
+from cg_dynamics.ros import (
+    SENSOR_QOS,
+    DeclaredSettings,
+    Throttled,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
 from cg_dynamics.settings import setting
 from cg_estimation.estimator import Estimate
 from cg_estimation.observer_settings import ObserverSettings, make_estimator, tune
@@ -63,6 +70,8 @@ class ObserverNode(Node):
             self._angles, self._rates = [0, 1, rotor], [2, 3, rotor + 1]
         self.message = JointState(name=[*STANCES, ROTOR][: len(self._angles)])
         self._published = 0
+        self._warn_stance = Throttled(self.get_logger().warning)
+        self._warn_blind = Throttled(self.get_logger().warning)
         self._withheld = 0
         self._longest = 0.0
         self._next_diagnosis = 0.0
@@ -130,9 +139,8 @@ class ObserverNode(Node):
         for measurement in self.gatherer.due():
             if not self._begun and self.declared.values.stance == 'contacts':
                 if measurement.stance is None:
-                    self.get_logger().warning(
-                        'the foot contacts do not tell which leg stands; no state is published',
-                        throttle_duration_sec=1.0,
+                    self._warn_stance(
+                        'the foot contacts do not tell which leg stands; no state is published'
                     )
                     continue
             self._begun = True
@@ -155,10 +163,7 @@ class ObserverNode(Node):
     def _publish(self, estimate: Estimate, longest_blind: float) -> None:
         if not estimate.blind <= longest_blind:
             self._withheld += 1
-            self.get_logger().warning(
-                f'no position for {estimate.blind:.3g} s; no state is published',
-                throttle_duration_sec=1.0,
-            )
+            self._warn_blind(f'no position for {estimate.blind:.3g} s; no state is published')
             return
         x = estimate.x
         self.message.header.stamp = to_stamp(estimate.stamp_ns)

@@ -7,8 +7,13 @@ command that was fit to be held and answers, at any instant, which torque may ac
   the next good one;
 - a command beyond the limit is brought back to the limit (a motor saturates as well);
 - a command older than `stale_after` counts as lost: torque zero;
+- a command dated more than one sample ahead of the last measurement is refused when it comes, and
+  changes nothing: it neither acts later nor stands before a good one;
+- while more than one publisher is on the topic, nobody knows who controls: torque zero;
 - optionally, the torque climbs away from zero no faster than `rate_limit`; towards zero it is
   always free.
+
+The safety gate and the simulated hardware, in both its modes, apply these rules by this class.
 """
 
 import math
@@ -38,6 +43,18 @@ class GateSettings(Settings):
     rate_limit: float = setting(
         0.0, 'fastest growth of the torque, 0 for no limit', unit='N m/s', minimum=0.0, live=True
     )
+    sample_rate_hz: float = setting(
+        500.0,
+        'rate of the measurements; a command dated more than one sample ahead is refused',
+        unit='Hz',
+        minimum=10.0,
+        maximum=2000.0,
+    )
+
+    @property
+    def sample_ns(self) -> int:
+        """Time between two measurements in ns."""
+        return round(NANOSECONDS / self.sample_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -47,10 +64,12 @@ class Judgement:
     Attributes:
         torque: In N m, one per joint.
         doubt: Empty if the request passes as it is.
+        refused: The request changes nothing, and no answer to it may go on.
     """
 
     torque: tuple[float, ...]
     doubt: str = ''
+    refused: bool = False
 
 
 def judge(request: Sequence[float], joints: Sequence[str], limit: float) -> Judgement:
@@ -77,23 +96,67 @@ def judge(request: Sequence[float], joints: Sequence[str], limit: float) -> Judg
 
 
 class TorqueGate:
-    """Remembers the last command and says at any instant which torque may act."""
+    """Remembers the last command and says at any instant which torque may act.
+
+    Attributes:
+        settings: May be replaced at any time.
+        joints: Names of the joints, in the order of the torques.
+        publishers: How many publishers the topic of the commands has.
+    """
 
     def __init__(self, settings: GateSettings, joints: Sequence[str]):
         self.settings = settings
         self.joints = tuple(joints)
+        self.publishers = 1
         self._zero = (0.0,) * len(self.joints)
         self._held = Judgement(self._zero, 'no command yet')
-        self._held_ns: int | None = None
+        self._held_ns: int | None = None  # stamp of the command that is held
+        self._since_ns = 0  # the same instant on the clock of `torque`
         self._output = self._zero
         self._output_ns: int | None = None
 
-    def offer(self, request: Sequence[float], stamp_ns: int) -> Judgement:
-        """Take in a command made at `stamp_ns`; older than the one held, it is ignored."""
-        if self._held_ns is not None and stamp_ns < self._held_ns:
-            return Judgement(self._held.torque, 'older than the command before it; ignored')
+    @property
+    def rivalry(self) -> str:
+        """Why nobody is listened to; empty with one publisher or none."""
+        if self.publishers <= 1:
+            return ''
+        return f'{self.publishers} publishers of the torque; zero until one is left'
+
+    def offer(
+        self, request: Sequence[float], stamp_ns: int, now_ns: int, measured_ns: int | None = None
+    ) -> Judgement:
+        """Take in a command, or refuse it.
+
+        Args:
+            request: Torque asked for, in N m, one per joint.
+            stamp_ns: Of the measurement that it answers; 0 for the last one.
+            now_ns: Present instant of the clock by which `torque` is asked.
+            measured_ns: Stamp of the last measurement, on the clock of `stamp_ns`; None where that
+                is also the clock of `torque`, and the last measurement is now.
+
+        Returns:
+            What came of it. The torque that acts is said by `torque` alone.
+        """
+        measured_ns = now_ns if measured_ns is None else measured_ns
+        stamp_ns = stamp_ns or measured_ns
+        ahead = stamp_ns - measured_ns
+        if self.rivalry:
+            self.drop(self.rivalry)
+            return self._held
+        if ahead > self.settings.sample_ns:
+            return Judgement(
+                self._held.torque,
+                f'dated {ahead / NANOSECONDS:.3g} s ahead of the last measurement; refused',
+                refused=True,
+            )
+        if self._in_force(now_ns) and self._held_ns is not None and stamp_ns < self._held_ns:
+            return Judgement(
+                self._held.torque, 'older than the command before it; ignored', refused=True
+            )
         self._held = judge(request, self.joints, self.settings.torque_limit)
-        self._held_ns = stamp_ns
+        # What is a little early counts as of now: it must not stand before the next one.
+        self._held_ns = min(stamp_ns, measured_ns)
+        self._since_ns = now_ns + min(ahead, 0)
         return self._held
 
     def drop(self, reason: str) -> None:
@@ -102,16 +165,22 @@ class TorqueGate:
         self._held_ns = None
 
     def torque(self, now_ns: int) -> Judgement:
-        """The torque that may act at `now_ns`, a time of the same clock as the stamps."""
+        """The torque that may act at `now_ns`."""
         judgement = self._held
-        if self._held_ns is not None:
-            age = (now_ns - self._held_ns) / NANOSECONDS
-            if abs(age) > self.settings.stale_after:
-                kind = 'old' if age > 0.0 else 'ahead of the clock'
-                judgement = Judgement(self._zero, f'command is {abs(age):.3g} s {kind}')
+        if self.rivalry:
+            self.drop(self.rivalry)
+            judgement = self._held
+        elif self._held_ns is not None and not self._in_force(now_ns):
+            age = (now_ns - self._since_ns) / NANOSECONDS
+            kind = 'old' if age > 0.0 else 'ahead of the clock'
+            judgement = Judgement(self._zero, f'command is {abs(age):.3g} s {kind}')
         torque = self._slowed(judgement.torque, now_ns)
         self._output, self._output_ns = torque, now_ns
         return Judgement(torque, judgement.doubt)
+
+    def _in_force(self, now_ns: int) -> bool:
+        age = now_ns - self._since_ns
+        return self._held_ns is not None and 0 <= age <= self.settings.stale_after * NANOSECONDS
 
     def _slowed(self, wanted: tuple[float, ...], now_ns: int) -> tuple[float, ...]:
         if self.settings.rate_limit == 0.0:

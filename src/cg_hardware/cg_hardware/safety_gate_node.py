@@ -5,8 +5,11 @@ Put it between a controller and the hardware by remapping the controller's outpu
     ros2 run cg_control balance_node --ros-args -r /torque_command:=/torque_request
 
 Every request that passes is sent on at once with its own stamp, so that lock-step works through
-the gate. When requests stop for longer than `stale_after`, zero torque is sent until they come
-back; the hardware has a watchdog of its own behind it.
+the gate. It listens to the measurements as well, because their stamps are the clock by which a
+request is dated ahead or old. When requests stop for longer than `stale_after`, zero torque is
+sent until they come back. That zero carries the stamp of the last request, so that a machine that
+was held up does not take it for one from the future, and a machine in lock-step not for an answer.
+The hardware has a watchdog of its own behind the gate.
 """
 
 import time
@@ -14,9 +17,16 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 
-from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_stamp
+from cg_dynamics.ros import (
+    SENSOR_QOS,
+    DeclaredSettings,
+    Throttled,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
 from cg_dynamics.settings import setting
 from cg_hardware import topics
 from cg_hardware.safety import GateSettings, TorqueGate
@@ -39,28 +49,59 @@ class SafetyGateNode(Node):
         super().__init__('safety_gate', **kwargs)
         self.declared = DeclaredSettings(self, GateNodeSettings, at_work=lambda: self.started)
         self.started = True
-        self.joints = topics.joints_of(self.declared.values.mechanism)
+        mechanism = self.declared.values.mechanism
+        self.joints = topics.joints_of(mechanism)
         self.gate = TorqueGate(self.declared.values, self.joints)
         self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        self.create_subscription(JointState, topics.TORQUE_REQUEST, self.on_request, SENSOR_QOS)
+        self.requests = self.create_subscription(
+            JointState, topics.TORQUE_REQUEST, self.on_request, SENSOR_QOS
+        )
+        measurement = topics.MEASUREMENT[mechanism]
+        self.measurements = self.create_subscription(
+            Imu if measurement == topics.IMU else JointState,
+            measurement,
+            self.on_measurement,
+            SENSOR_QOS,
+        )
         self.message = JointState(name=list(self.joints))
-        self.message.header.frame_id = topics.TORQUE_FRAME[self.declared.values.mechanism]
+        self.message.header.frame_id = topics.TORQUE_FRAME[mechanism]
+        self._measured_ns: int | None = None
         self._stale = True
-        self._doubts = 0
+        self.doubts = 0  # since the node started
+        self._told = 0
+        self._warn = Throttled(self.get_logger().warning)
         self._next_diagnosis = 0.0
+
+    def on_measurement(self, message: Imu | JointState) -> None:
+        """Note how far the clock of the machine is."""
+        self._measured_ns = to_nanoseconds(message.header.stamp)
+
+    def _measured(self, stamp_ns: int) -> int:
+        """Stamp of the last measurement.
+
+        Before the first one there is only the wall clock to tell what is dated ahead. It does not
+        tell what is old: in lock-step the clock of the machine starts at 1 s.
+        """
+        if self._measured_ns is not None:
+            return self._measured_ns
+        return min(stamp_ns, time.time_ns())
 
     def on_request(self, request: JointState) -> None:
         """Judge a request and pass on what may act."""
         self.gate.settings = self.declared.values
-        now = time.monotonic_ns()
+        self.gate.publishers = self.requests.get_publisher_count()
+        now, stamp_ns = time.monotonic_ns(), to_nanoseconds(request.header.stamp)
         try:
-            judgement = self.gate.offer(torques_of(request, self.joints), now)
+            torques = torques_of(request, self.joints)
+            judgement = self.gate.offer(torques, stamp_ns, now, self._measured(stamp_ns))
         except ValueError as error:
             self.gate.drop(str(error))
             judgement = self.gate.torque(now)
         if judgement.doubt:
             self._doubt(judgement.doubt)
+        if judgement.refused:
+            return
         self._stale = False
         self.message.header.stamp = request.header.stamp
         self._send(self.gate.torque(now).torque)
@@ -68,11 +109,11 @@ class SafetyGateNode(Node):
     def poll(self) -> float:
         """Send zero torque while requests are missing."""
         now = time.monotonic_ns()
+        self.gate.publishers = self.requests.get_publisher_count()
         judgement = self.gate.torque(now)
         if judgement.doubt and not self._stale:
             self._stale = True
             self._doubt(judgement.doubt)
-            self.message.header.stamp = to_stamp(time.time_ns())
             self._send(judgement.torque)
         if now / 1e9 > self._next_diagnosis:
             self._next_diagnosis = now / 1e9 + 1.0
@@ -84,22 +125,27 @@ class SafetyGateNode(Node):
         self.publisher.publish(self.message)
 
     def _doubt(self, reason: str) -> None:
-        self._doubts += 1
-        self.get_logger().warning(f'torque request: {reason}', throttle_duration_sec=1.0)
+        self.doubts += 1
+        self._warn(f'torque request: {reason}')
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name='safety_gate', hardware_id='torque path')
-        status.level = DiagnosticStatus.WARN if self._doubts else DiagnosticStatus.OK
+        news = self.doubts - self._told
+        status.level = DiagnosticStatus.WARN if news else DiagnosticStatus.OK
         status.message = 'no requests' if self._stale else 'passing'
-        status.values = [KeyValue(key='requests_in_doubt', value=str(self._doubts))]
+        if self.gate.rivalry:
+            status.level, status.message = DiagnosticStatus.ERROR, self.gate.rivalry
+        status.values = [
+            KeyValue(key='requests_in_doubt', value=str(news)),
+            KeyValue(key='publishers', value=str(self.gate.publishers)),
+        ]
         array = DiagnosticArray(status=[status])
         array.header.stamp = to_stamp(time.time_ns())
         self.diagnostics.publish(array)
-        self._doubts = 0
+        self._told = self.doubts
 
     def close(self) -> None:
-        """Leave with zero torque."""
-        self.message.header.stamp = to_stamp(time.time_ns())
+        """Leave with zero torque, in the place of the last request."""
         self._send((0.0,) * len(self.joints))
 
 

@@ -130,9 +130,9 @@ def torques_of(message: JointState, joints: tuple[str, ...]) -> list[float]:
     """Efforts of a command in the order of `joints`.
 
     Raises:
-        ValueError: The message names other joints or holds fewer efforts than names.
+        ValueError: The message names no joints or others, or holds fewer efforts than names.
     """
-    names = list(message.name) or list(joints)
+    names = list(message.name)
     if sorted(names) != sorted(joints):
         raise ValueError(f'command names {names}; expected {list(joints)}')
     if len(message.effort) != len(names):

@@ -17,6 +17,7 @@ from cg_dynamics.settings import Settings, setting
 NOMINAL_MODEL = 'compass_gait_mit'
 SOFTWARE = 'compass-gait 0.1.0'
 NANOSECONDS = 1_000_000_000
+CATCH_UP = 2.0  # simulated s per s that a late machine takes at most
 LOCKSTEP_EPOCH_NS = NANOSECONDS  # simulated time starts at 1 s: a stamp of zero means "unset"
 
 
@@ -193,26 +194,34 @@ def ticks_of(duration: float, rate_hz: float) -> int | None:
 class Pace:
     """Which samples are due on a clock, and how late they were taken.
 
-    A late machine catches up: no sample is ever left out, lateness is counted instead.
+    A late machine catches up: no sample is ever left out, lateness is counted instead. It does so
+    at `CATCH_UP` times the speed of the clock, so that controllers keep up and the loop stays
+    closed meanwhile.
     """
 
     def __init__(self, rate_hz: float, start_ns: int):
         self.period_ns = round(NANOSECONDS / rate_hz)
         self.start_ns = start_ns
+        self.earliest_ns = start_ns
         self.taken = 0
         self.worst_ns = 0
         self.late = 0
 
     @property
     def next_ns(self) -> int:
-        """When the next sample is due."""
-        return self.start_ns + self.taken * self.period_ns
+        """When the next sample is to be taken."""
+        return max(self.start_ns + self.taken * self.period_ns, self.earliest_ns)
+
+    def lateness(self, now_ns: int) -> int:
+        """How long the next sample has been due, in ns."""
+        return now_ns - self.start_ns - self.taken * self.period_ns
 
     def take(self, now_ns: int) -> bool:
         """Take the next sample if it is due."""
-        lateness = now_ns - self.next_ns
-        if lateness < 0:
+        if now_ns < self.next_ns:
             return False
+        lateness = self.lateness(now_ns)
+        self.earliest_ns = now_ns + round(self.period_ns / CATCH_UP)
         self.taken += 1
         self.worst_ns = max(self.worst_ns, lateness)
         self.late += lateness > self.period_ns

@@ -27,12 +27,13 @@ from cg_dynamics.ros import (
     LATCHED_QOS,
     SENSOR_QOS,
     DeclaredSettings,
+    Throttled,
     run,
     to_nanoseconds,
     to_stamp,
 )
 from cg_hardware import topics
-from cg_hardware.safety import GateSettings, TorqueGate, judge
+from cg_hardware.safety import GateSettings, TorqueGate
 from cg_hardware.sensor_publishers import SensorPublishers, torques_of
 from cg_hardware.simulation import (
     LOCKSTEP_EPOCH_NS,
@@ -51,7 +52,6 @@ RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorde
 LATE = 0.02  # s behind the clock that are worth a warning
 REPEAT = 0.1  # s between repetitions of the first measurement of a lock-step run
 SILENCE = 2.0  # s after which another publisher of the machine's topics counts as dead
-WARNING_PERIOD = 1.0  # s between equal warnings
 
 
 class SimulationNode(LifecycleNode):
@@ -71,6 +71,8 @@ class SimulationNode(LifecycleNode):
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         self._next_diagnosis = 0.0
         self._faults = 0
+        self._warn = Throttled(self.get_logger().warning)
+        self._warn_late = Throttled(self.get_logger().warning)
         self._eavesdropper = None
         self._silent_ghosts = False
         if self.settings.autostart:
@@ -105,7 +107,11 @@ class SimulationNode(LifecycleNode):
         self.limit = self.settings.torque_limit or float(model.torque_limit)
         if math.isinf(self.limit):
             self.get_logger().warning('the model states no torque limit; nothing is limited')
-        gate = GateSettings(torque_limit=self.limit, stale_after=self.settings.stale_after)
+        gate = GateSettings(
+            torque_limit=self.limit,
+            stale_after=self.settings.stale_after,
+            sample_rate_hz=self.settings.sample_rate_hz,
+        )
         self.gate = TorqueGate(gate, self.joints)
         self.lockstep = self.settings.mode == 'lockstep'
         self.zeroed_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
@@ -253,13 +259,22 @@ class SimulationNode(LifecycleNode):
         return self.epoch_ns + round(self.ticks * NANOSECONDS / self.settings.sample_rate_hz)
 
     def _publish_measurement(self) -> None:
+        self._measured_ns = self._stamp()
         if self.clock_publisher is not None:
-            self.clock_publisher.publish(Clock(clock=to_stamp(self._stamp())))
+            self.clock_publisher.publish(Clock(clock=to_stamp(self._measured_ns)))
         impulse = self.settings.pushes_at(self.ticks)
         if impulse:
             self.plant.push(impulse)
         self._measurement = self.plant.measure()
-        self.sensors.publish_measurement(self._stamp(), self._measurement)
+        self.sensors.publish_measurement(self._measured_ns, self._measurement)
+
+    def _torque(self) -> tuple[float, ...]:
+        """What the gate lets act in the sample that was measured last."""
+        self.gate.publishers = self.command.get_publisher_count()
+        judgement = self.gate.torque(self._measured_ns)
+        if judgement.doubt and judgement.doubt != 'no command yet':
+            self._doubt(judgement.doubt)
+        return judgement.torque
 
     def _apply(self, torque: tuple[float, ...]) -> bool:
         """Latch, publish what was latched, let one sample time pass; False if the run broke."""
@@ -286,42 +301,46 @@ class SimulationNode(LifecycleNode):
                 self._begin_to_finish()
                 return 0.0
             self._publish_measurement()
-            judgement = self.gate.torque(self._stamp())
-            if judgement.doubt and judgement.doubt != 'no command yet':
-                self._doubt(judgement.doubt)
-            if not self._apply(judgement.torque):
+            if not self._apply(self._torque()):
                 return 0.0
-        ahead = (self.pace.next_ns - time.monotonic_ns()) / NANOSECONDS
-        if ahead < -LATE:
-            self.get_logger().warning(
-                f'{-ahead:.3f} s late: too busy a machine for real time; no sample is left out',
-                throttle_duration_sec=WARNING_PERIOD,
+        now_ns = time.monotonic_ns()
+        late = self.pace.lateness(now_ns) / NANOSECONDS
+        if late > LATE:
+            self._warn_late(
+                f'{late:.3f} s late: too busy a machine for real time; no sample is left out'
             )
-        return max(0.0, ahead)
+        return max(0.0, (self.pace.next_ns - now_ns) / NANOSECONDS)
 
     def on_command(self, message: JointState) -> None:
         """Take in a torque command."""
         if self.phase != 'running':
             return
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        if self.lockstep and not (self._awaiting and stamp_ns == self._measured_ns):
+            return
+        self.gate.publishers = self.command.get_publisher_count()
         try:
-            request = torques_of(message, self.joints)
+            torques = torques_of(message, self.joints)
         except ValueError as error:
             self.gate.drop(str(error))
-            self._doubt(str(error))
-            request = [0.0] * len(self.joints)
-        stamp_ns = to_nanoseconds(message.header.stamp)
+            fit, doubt = False, str(error)
+        else:
+            judgement = self.gate.offer(torques, stamp_ns, self._measured_ns)
+            fit, doubt = not judgement.refused, judgement.doubt
         if self.lockstep:
-            self._answer(stamp_ns, request)
+            self._answered()  # says what is in doubt
             return
-        if self._awaiting_first:
-            # Somebody controls the machine; its time begins now.
-            self._awaiting_first = False
-            self.epoch_ns = time.time_ns()
-            self.pace = Pace(self.settings.sample_rate_hz, time.monotonic_ns())
-            return
-        judgement = self.gate.offer(request, stamp_ns or self._stamp())
-        if judgement.doubt:
-            self._doubt(judgement.doubt)
+        if doubt:
+            self._doubt(doubt)
+        if self._awaiting_first and fit:
+            self._start_clock()
+
+    def _start_clock(self) -> None:
+        """Somebody controls the machine; its time begins now."""
+        self._awaiting_first = False
+        self.gate.drop('no command yet')
+        self.epoch_ns = time.time_ns()
+        self.pace = Pace(self.settings.sample_rate_hz, time.monotonic_ns())
 
     # Lock-step
 
@@ -334,14 +353,10 @@ class SimulationNode(LifecycleNode):
         self._deadline = now + self.settings.answer_timeout
         self._repeat_at = now + REPEAT
 
-    def _answer(self, stamp_ns: int, request: list[float]) -> None:
-        if not self._awaiting or stamp_ns != self._stamp():
-            return
-        judgement = judge(request, self.joints, self.limit)
-        if judgement.doubt:
-            self._doubt(judgement.doubt)
+    def _answered(self) -> None:
+        """Apply what the gate makes of the answer, and go on."""
         self._awaiting = False
-        if not self._apply(judgement.torque):
+        if not self._apply(self._torque()):
             return
         if self.total is not None and self.ticks >= self.total:
             self._begin_to_finish()
@@ -432,9 +447,7 @@ class SimulationNode(LifecycleNode):
 
     def _doubt(self, reason: str) -> None:
         self._faults += 1
-        self.get_logger().warning(
-            f'torque command: {reason}', throttle_duration_sec=WARNING_PERIOD
-        )
+        self._warn(f'torque command: {reason}')
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name='simulation_node', hardware_id='simulation')
@@ -449,6 +462,8 @@ class SimulationNode(LifecycleNode):
                 if self.pace.late:
                     status.level = DiagnosticStatus.WARN
                 self.pace.forget()
+            if self.gate.rivalry:
+                status.level, status.message = DiagnosticStatus.ERROR, self.gate.rivalry
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = to_stamp(time.time_ns())

@@ -20,6 +20,13 @@ RECORDER_PROGRESS = '/recorder/progress'
 CLOCK = '/clock'
 DIAGNOSTICS = '/diagnostics'
 
+# The topic that completes a measurement, and that a controller answers.
+MEASUREMENT = {
+    'compass_gait': IMU,
+    'pendulum': JOINT_STATES,
+    'double_pendulum': JOINT_STATES,
+}
+
 
 def joints_of(mechanism: str) -> tuple[str, ...]:
     """Joint names of the torque messages of a mechanism.

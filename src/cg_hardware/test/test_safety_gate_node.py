@@ -7,44 +7,74 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
+from sensor_msgs.msg import Imu, JointState  # noqa: E402
 
 from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import SENSOR_QOS, to_stamp  # noqa: E402
+from cg_dynamics.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 
 pytestmark = pytest.mark.alone
+
+
+class Bench:
+    """A gate, and a peer that asks, measures and listens."""
+
+    def __init__(self):
+        self.gate = SafetyGateNode(parameter_overrides=[Parameter('torque_limit', value=10.0)])
+        self.peer = Node('peer')
+        self.commands, self.reports = [], []
+        self.peer.create_subscription(
+            JointState, '/torque_command', self.commands.append, SENSOR_QOS
+        )
+        self.peer.create_subscription(
+            DiagnosticArray, '/diagnostics', lambda m: self.reports.extend(m.status), 10
+        )
+        self.publisher = self.peer.create_publisher(JointState, '/torque_request', SENSOR_QOS)
+        self.imu = self.peer.create_publisher(Imu, '/imu', SENSOR_QOS)
+        self.executor = EventsExecutor()
+        for node in (self.gate, self.peer):
+            self.executor.add_node(node)
+        self.until(
+            lambda: (
+                self.publisher.get_subscription_count()
+                and self.imu.get_subscription_count()
+                and self.gate.publisher.get_subscription_count()
+                and self.gate.diagnostics.get_subscription_count()
+            )
+        )
+
+    def until(self, condition):
+        deadline = time.monotonic() + 20.0
+        while not condition():
+            assert time.monotonic() < deadline
+            self.executor.spin_once(timeout_sec=self.gate.poll())
+
+    def measure(self, nanoseconds):
+        message = Imu()
+        message.header.stamp = to_stamp(nanoseconds)
+        self.imu.publish(message)
+        self.until(lambda: self.gate._measured_ns == nanoseconds)
+
+    def __iter__(self):
+        return iter((self.gate, self.publisher, self.commands, self.until))
+
+    def close(self):
+        for node in (self.gate, self.peer):
+            self.executor.remove_node(node)
+            node.destroy_node()
 
 
 @pytest.fixture
 def bench():
     with own_domain():
         rclpy.init()
-        gate = SafetyGateNode(parameter_overrides=[Parameter('torque_limit', value=10.0)])
-        peer = Node('peer')
-        commands = []
-        peer.create_subscription(JointState, '/torque_command', commands.append, SENSOR_QOS)
-        publisher = peer.create_publisher(JointState, '/torque_request', SENSOR_QOS)
-        executor = EventsExecutor()
-        for node in (gate, peer):
-            executor.add_node(node)
-
-        def until(condition):
-            deadline = time.monotonic() + 20.0
-            while not condition():
-                assert time.monotonic() < deadline
-                executor.spin_once(timeout_sec=gate.poll())
-
-        until(
-            lambda: publisher.get_subscription_count() and gate.publisher.get_subscription_count()
-        )
-        yield gate, publisher, commands, until
-        for node in (gate, peer):
-            executor.remove_node(node)
-            node.destroy_node()
+        bench = Bench()
+        yield bench
+        bench.close()
         rclpy.try_shutdown()
 
 
@@ -54,21 +84,79 @@ def request(torque, nanoseconds):
     return message
 
 
+def answers_to(commands):
+    """The first answer to each request, by stamp in ns; silence repeats a stamp with zero."""
+    answers = {}
+    for message in commands:
+        answers.setdefault(to_nanoseconds(message.header.stamp), message.effort[0])
+    return answers
+
+
 def test_requests_pass_within_limits_and_keep_their_stamp(bench):
     _, publisher, commands, until = bench
     for index, torque in enumerate((2.0, 50.0, math.nan), start=1):
         publisher.publish(request(torque, index))
-        until(lambda count=index: len([m for m in commands if m.header.stamp.sec == 0]) >= count)
-    answers = [m for m in commands if m.header.stamp.sec == 0]
-    assert [m.effort[0] for m in answers] == [2.0, 10.0, 0.0]
-    assert [m.header.stamp.nanosec for m in answers] == [1, 2, 3]
+        until(lambda index=index: index in answers_to(commands))
+    assert answers_to(commands) == {1: 2.0, 2: 10.0, 3: 0.0}
 
 
-def test_silence_gives_one_zero(bench):
+def test_silence_gives_one_zero_in_the_place_of_the_last_request(bench):
     _, publisher, commands, until = bench
     publisher.publish(request(2.0, 5))
     until(lambda: len(commands) >= 2)
     assert commands[-1].effort[0] == 0.0
+    assert to_nanoseconds(commands[-1].header.stamp) == 5
+
+
+@pytest.mark.parametrize('measured', [False, True], ids=['by the wall clock', 'by measurements'])
+@pytest.mark.parametrize('ahead', [0.015, 3.0, 3600.0])
+def test_a_request_dated_ahead_goes_nowhere(bench, measured, ahead):
+    gate, publisher, commands, until = bench
+    now = time.time_ns()
+    if measured:
+        now = 10**9
+        bench.measure(now)
+    publisher.publish(request(7.0, now + round(ahead * 1e9)))
+    until(lambda: gate.doubts)
+    publisher.publish(request(2.0, now))
+    until(lambda: commands)
+    assert set(answers_to(commands)) == {now}
+    assert max(message.effort[0] for message in commands) == 2.0
+
+
+def test_an_old_request_is_answered_with_zero(bench):
+    _, publisher, commands, until = bench
+    bench.measure(10**9)
+    publisher.publish(request(7.0, 10**9 - 30_000_000))
+    until(lambda: commands)
+    assert commands[0].effort[0] == 0.0
+
+
+@pytest.mark.parametrize('names', [[], ['knee'], ['hip', 'hip']])
+def test_a_request_must_name_its_joint(bench, names):
+    _, publisher, commands, until = bench
+    message = request(7.0, 1)
+    message.name = names
+    publisher.publish(message)
+    until(lambda: commands)
+    assert commands[0].effort[0] == 0.0
+
+
+def test_a_second_publisher_is_an_error_and_nobody_gets_torque(bench):
+    gate, publisher, commands, until = bench
+    rival = bench.peer.create_publisher(JointState, '/torque_request', SENSOR_QOS)
+    until(lambda: gate.requests.get_publisher_count() == 2)
+    for stamp, speaker in enumerate((publisher, rival, publisher), start=1):
+        speaker.publish(request(2.0, stamp))
+        until(lambda stamp=stamp: stamp in answers_to(commands))
+    assert answers_to(commands) == {1: 0.0, 2: 0.0, 3: 0.0}
+    until(lambda: any('2 publishers' in status.message for status in bench.reports))
+    assert bench.reports[-1].level == DiagnosticStatus.ERROR
+    bench.peer.destroy_publisher(rival)
+    until(lambda: gate.requests.get_publisher_count() == 1)
+    publisher.publish(request(2.0, 4))
+    until(lambda: 4 in answers_to(commands))
+    assert answers_to(commands)[4] == 2.0
 
 
 def test_limits_can_be_changed_while_it_runs_and_nonsense_is_refused(bench):

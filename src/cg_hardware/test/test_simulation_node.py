@@ -9,6 +9,7 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from lifecycle_msgs.msg import State, Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.msg import ParameterType  # noqa: E402
@@ -213,6 +214,80 @@ def test_real_time_command_for_another_joint_is_refused(bench):
     count = len(bench.applied)
     bench.until(lambda: len(bench.applied) > count + 50)
     assert {m.effort[0] for m in bench.applied} == {0.0}
+
+
+@pytest.mark.parametrize('ahead', [15_000_000, 3_000_000_000, 3600 * 10**9])
+def test_real_time_command_dated_ahead_neither_acts_nor_shadows(bench, ahead):
+    machine = bench.machine()
+    bench.until(lambda: machine.phase == 'running' and bench.measured)
+    bench.send(7.0, to_stamp(time.time_ns() + ahead))
+    bench.until(lambda: machine._faults)
+    count = len(bench.applied)
+    bench.until(lambda: len(bench.applied) > count + 30)
+    assert {m.effort[0] for m in bench.applied} == {0.0}
+    bench.answer = lambda message: 3.0
+    bench.until(lambda: bench.applied[-1].effort[0] == 3.0, patience=1.0)
+
+
+@pytest.mark.parametrize('mode', ['real_time', 'lockstep'])
+@pytest.mark.parametrize('names', [[], ['knee']])
+def test_a_command_must_name_its_joint(bench, mode, names):
+    machine = bench.machine(mode=mode, duration=0.02, await_answer=False)
+
+    def answer(message):
+        command = JointState(name=names, effort=[3.0])
+        command.header.stamp = message.header.stamp
+        bench.command.publish(command)
+
+    bench.answer = answer
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 10)
+    assert {m.effort[0] for m in bench.applied} == {0.0}
+    assert machine.exit_status == 0
+
+
+@pytest.mark.parametrize('mode', ['real_time', 'lockstep'])
+def test_two_publishers_get_no_torque_until_one_is_left(bench, mode):
+    bench.answer = lambda message: 3.0
+    machine = bench.machine(mode=mode)
+    reports = []
+    bench.controller.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda m: reports.extend(m.status), 10
+    )
+    bench.until(lambda: bench.applied and bench.applied[-1].effort[0] == 3.0)
+    rival = bench.controller.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+    bench.until(lambda: machine.command.get_publisher_count() == 2)
+    count = len(bench.applied)
+    bench.until(
+        lambda: any(r.level == DiagnosticStatus.ERROR and '2 publ' in r.message for r in reports)
+    )
+    # The one on its way when the second publisher came was latched before.
+    assert {m.effort[0] for m in bench.applied[count + 2 :]} == {0.0}
+    bench.controller.destroy_publisher(rival)
+    bench.until(lambda: bench.applied[-1].effort[0] == 3.0)
+
+
+def test_a_machine_that_was_held_up_is_under_control_again_at_once(bench):
+    bench.add(SafetyGateNode())
+    bench.controller.destroy_publisher(bench.command)
+    bench.command = bench.controller.create_publisher(JointState, '/torque_request', SENSOR_QOS)
+    bench.answer = lambda message: 3.0
+    machine = bench.machine()
+    bench.until(lambda: bench.applied and bench.applied[-1].effort[0] == 3.0)
+    for _ in range(3):
+        # The machine stands still; the gate meanwhile sends zero.
+        gate = bench.nodes[1]
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end:
+            bench.executor.spin_once(timeout_sec=min(gate.poll(), 0.01))
+        assert gate._stale
+        count = len(bench.applied)
+        bench.until(lambda count=count: len(bench.applied) >= count + 200)
+        torques = [m.effort[0] for m in bench.applied[count : count + 200]]
+        # One watchdog time, 20 ms, is ten samples.
+        assert 3.0 in torques[:10]
+        assert torques[10:].count(0.0) <= 2
+    assert set(np.diff(stamps(bench.applied))) == {2_000_000}
+    assert machine.phase == 'running'
 
 
 def test_parameters_are_refused_with_a_reason(bench):
