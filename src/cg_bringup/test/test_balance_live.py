@@ -1,5 +1,6 @@
 """The balancing loop as processes on topics: deterministic in lock-step, safe when one dies."""
 
+import itertools
 import signal
 import time
 
@@ -8,8 +9,11 @@ import yaml
 
 rclpy = pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.srv import SetParameters  # noqa: E402
 from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
@@ -31,7 +35,8 @@ class Loop:
 
     def __init__(self, directory, setup=None, **options):
         self.node = Node('ear')
-        self.applied, self.states = [], []
+        self.applied, self.states, self.reports = [], [], []
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self.on_report, 100)
         self.node.create_subscription(JointState, '/applied_torque', self.on_applied, ENOUGH)
         self.node.create_subscription(JointState, '/state', self.states.append, ENOUGH)
         self.executor = EventsExecutor()
@@ -44,6 +49,12 @@ class Loop:
 
     def on_applied(self, message):
         self.applied.append((to_nanoseconds(message.header.stamp), message.effort[0]))
+
+    def on_report(self, message):
+        for status in message.status:
+            if status.name == 'balance':
+                values = {item.key: item.value for item in status.values}
+                self.reports.append((status.message, int(values['missed_deadlines'])))
 
     def until(self, condition, patience=PATIENCE):
         deadline = time.monotonic() + patience
@@ -130,3 +141,31 @@ def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):
     late = [torque for stamp, torque in run.applied if stamp > after]
     assert len(late) > 90
     assert set(late) == {0.0}
+
+
+@pytest.mark.parametrize('mode', ['lockstep', 'real_time'])
+def test_two_hundred_changes_of_a_weight_disturb_nothing(loop, mode):
+    run = loop(mode=mode, stance='inner', lean=0.03)
+    client = run.node.create_client(SetParameters, '/balance/set_parameters')
+    run.until(lambda: client.service_is_ready() and len(run.applied) > 500)
+    # The same number of samples without changes tells what this machine misses by itself.
+    run.until(lambda: len(run.reports) > 3)
+    missed_before = sum(missed for _, missed in run.reports[1:])
+    reports, first = len(run.reports), len(run.applied)
+    for k in range(200):
+        scale = 0.075 if k % 2 else 0.1
+        request = SetParameters.Request(
+            parameters=[Parameter('lean_scale', value=scale).to_parameter_msg()]
+        )
+        future = client.call_async(request)
+        run.until(future.done)
+        assert future.result().results[0].successful
+    run.until(lambda: len(run.reports) > reports + 1)
+    assert {text for text, _ in run.reports[reports:]} == {'balancing'}
+    # It never lets go: zero torque twice in a row is what an idle controller sends.
+    torques = [torque for _, torque in run.applied[first:]]
+    assert not any(a == b == 0.0 for a, b in itertools.pairwise(torques))
+    assert max(abs(state.position[0]) for state in run.states[first:]) < 0.1
+    if mode == 'real_time':
+        missed = sum(missed for _, missed in run.reports[reports:])
+        assert missed <= missed_before + 2

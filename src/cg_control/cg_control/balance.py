@@ -103,48 +103,66 @@ class Command:
     reason: str = ''
 
 
-def balance_gains(
-    model: Model, settings: BalanceSettings, sample_time: float, elastic: bool = False
-) -> dict[str, np.ndarray]:
-    """Stance -> K of (BAL), shape (nx,).
+class BalanceDesign:
+    """The regulators of a model upright, for weights that may change.
+
+    What does not depend on the weights is done once, so that new gains take a millisecond.
 
     Args:
         model: A compass gait.
-        settings: Its scales count.
         sample_time: Over which the torque is held, s.
         elastic: Feed back the states of the transmission too.
-
-    Raises:
-        LqrError: naming the stance leg for which there is no regulator.
     """
-    R = np.array([[sample_time / settings.torque_scale**2]])
-    gains = {}
-    for stance in STANCES:
-        linear = linearise_stance(model, stance, elastic=elastic)
-        to_slow, from_slow = slow_modes(linear.A)
-        scales = [
-            settings.lean_scale,
-            settings.swing_scale,
-            settings.lean_rate_scale,
-            settings.swing_rate_scale,
-        ]
-        if stance == 'outer':
-            scales = [scales[1], scales[0], scales[3], scales[2]]
-        Q = np.zeros(linear.A.shape)
-        Q[[0, 1, 2, 3], [0, 1, 2, 3]] = sample_time / np.square(scales)
-        slow = replace(
-            linear,
-            A=to_slow @ linear.A @ from_slow,
-            B=to_slow @ linear.B,
-            rates=to_slow @ linear.rates,
-        )
-        sampled = discretise(slow, sample_time)
-        try:
-            regulator = dlqr(sampled.A, sampled.B, from_slow.T @ Q @ from_slow, R)
-            gains[stance] = (regulator.K @ to_slow)[0]
-        except LqrError as error:
-            raise LqrError(f'no gains for the {stance} leg as stance: {error}') from None
-    return gains
+
+    def __init__(self, model: Model, sample_time: float, elastic: bool = False):
+        self.sample_time = sample_time
+        self._plants = {}
+        for stance in STANCES:
+            linear = linearise_stance(model, stance, elastic=elastic)
+            to_slow, from_slow = slow_modes(linear.A)
+            slow = replace(
+                linear,
+                A=to_slow @ linear.A @ from_slow,
+                B=to_slow @ linear.B,
+                rates=to_slow @ linear.rates,
+            )
+            self._plants[stance] = (discretise(slow, sample_time), to_slow, from_slow)
+
+    def gains(self, settings: BalanceSettings) -> dict[str, np.ndarray]:
+        """Stance -> K of (BAL), shape (nx,).
+
+        Args:
+            settings: Its scales count.
+
+        Raises:
+            LqrError: naming the stance leg for which there is no regulator.
+        """
+        R = np.array([[self.sample_time / settings.torque_scale**2]])
+        gains = {}
+        for stance, (sampled, to_slow, from_slow) in self._plants.items():
+            scales = [
+                settings.lean_scale,
+                settings.swing_scale,
+                settings.lean_rate_scale,
+                settings.swing_rate_scale,
+            ]
+            if stance == 'outer':
+                scales = [scales[1], scales[0], scales[3], scales[2]]
+            # The states of a transmission, behind these four, weigh nothing.
+            rows = from_slow[:4]
+            Q = rows.T @ (rows * (self.sample_time / np.square(scales))[:, None])
+            try:
+                gains[stance] = (dlqr(sampled.A, sampled.B, Q, R).K @ to_slow)[0]
+            except LqrError as error:
+                raise LqrError(f'no gains for the {stance} leg as stance: {error}') from None
+        return gains
+
+
+def balance_gains(
+    model: Model, settings: BalanceSettings, sample_time: float, elastic: bool = False
+) -> dict[str, np.ndarray]:
+    """Stance -> K of (BAL), shape (nx,): `BalanceDesign` for weights that stay."""
+    return BalanceDesign(model, sample_time, elastic).gains(settings)
 
 
 def slow_modes(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

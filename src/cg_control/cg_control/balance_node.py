@@ -2,9 +2,8 @@
 
 Every state is answered by the command of its stamp, zero torque included, so that the same node
 works in real time and in lock-step. The gains are made when the node starts, and anew when a scale
-is set; a setting without a regulator is refused, the gains stay as they were. While the basin of
-new gains is being sampled (in a process of its own) a controller that balances goes on, one that
-does not waits.
+is set; a setting without a regulator is refused, the gains stay as they were. New gains act at the
+next state, and their basin follows (live_design.py): no parameter delays an answer.
 
 It also watches the loop: the age of the measurement when the drive latched the torque that answers
 it, and how many deadlines of `deadline` were missed, on /diagnostics.
@@ -12,10 +11,7 @@ it, and how many deadlines of `deadline` were missed, on /diagnostics.
 
 import collections
 import dataclasses
-import json
 import math
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,14 +22,8 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from cg_control.balance import (
-    BALANCING,
-    WEIGHTS,
-    BalanceController,
-    BalanceSettings,
-    balance_gains,
-)
-from cg_control.basin import Basin, modes_of, shipped_basins
+from cg_control.balance import BALANCING, WEIGHTS, BalanceSettings
+from cg_control.live_design import LiveDesign
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
@@ -75,14 +65,16 @@ class BalanceNode(Node):
         self.declared = DeclaredSettings(self, BalanceNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
         given = settings.model_file
-        self.path = str(Path(given).expanduser() if given else model_path(NOMINAL_MODEL))
-        self.model = Model.load(self.path)
-        gains = self._gains(settings)
-        self.controller = BalanceController(self.model, settings, gains)
-        self._samplers: dict[str, subprocess.Popen] = {}
-        self._basins: dict[str, Basin] | None = None
-        self._adopted = settings
-        self._find_basins()
+        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        self.design = LiveDesign(
+            path,
+            Model.load(path),
+            settings,
+            1.0 / settings.sample_rate_hz,
+            settings.elastic,
+            self.get_logger().info,
+        )
+        self.controller = self.design.controller
         self.add_on_set_parameters_callback(self._judge)
         self.message = JointState(name=['hip'])
         self.message.header.frame_id = 'hip'
@@ -98,86 +90,14 @@ class BalanceNode(Node):
         self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
         self.started = True
 
-    def _gains(self, settings: BalanceNodeSettings) -> dict[str, np.ndarray]:
-        return balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz, settings.elastic)
-
-    # Parameters
-
     def _judge(self, parameters: list) -> SetParametersResult:
         """Refuse settings for which there is no regulator."""
-        names = {field.name for field in dataclasses.fields(self.declared.values)}
-        changes = {p.name: p.value for p in parameters if p.name in names}
-        if not changes.keys() & set(WEIGHTS):
-            return SetParametersResult(successful=True)
+        changes = {p.name: p.value for p in parameters if p.name in WEIGHTS}
         try:
-            self._gains(dataclasses.replace(self.declared.values, **changes))
+            self.design.judge(dataclasses.replace(self.declared.values, **changes))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-    def _adopt(self) -> None:
-        """Take over what `ros2 param set` has changed."""
-        settings, before = self.declared.values, self._adopted
-        if settings is before:
-            return
-        self._adopted = settings
-        changed = {
-            field.name
-            for field in dataclasses.fields(settings)
-            if getattr(settings, field.name) != getattr(before, field.name)
-        }
-        if changed & set(WEIGHTS):
-            self.controller.adopt(settings, self._gains(settings))
-        else:
-            self.controller.adopt(settings)
-        if changed & {*WEIGHTS, 'torque_limit'}:
-            self._find_basins()
-
-    # Basins
-
-    def _find_basins(self) -> None:
-        for sampler in self._samplers.values():
-            sampler.kill()
-            sampler.wait()
-        gains, limit = self.controller.gains, self.controller.torque_limit
-        self._samplers = {}
-        self._basins = shipped_basins(self.model, gains, limit)
-        self.controller.basins = self._basins
-        if self._basins is None:
-            self.get_logger().info('sampling the basin of these gains')
-            self._bounds: dict[str, tuple[float, ...]] = {}
-            self._samplers = {
-                stance: subprocess.Popen(
-                    [
-                        *('nice', '-n', '10', sys.executable, '-m', 'cg_control.basin'),
-                        *(self.path, stance, repr(limit), '--'),
-                        *(repr(float(k)) for k in gains[stance][:4]),
-                    ],
-                    stdout=subprocess.PIPE,
-                    stdin=subprocess.DEVNULL,
-                )
-                for stance in STANCES
-            }
-
-    def _collect_basins(self) -> None:
-        for stance, sampler in list(self._samplers.items()):
-            if sampler.poll() is None:
-                continue
-            del self._samplers[stance]
-            text = sampler.stdout.read()
-            if sampler.returncode != 0:
-                self.get_logger().error(f'the basin of the {stance} leg could not be sampled')
-                continue
-            self._bounds[stance] = tuple(json.loads(text))
-            if len(self._bounds) == len(STANCES):
-                self._basins = {
-                    s: Basin(modes_of(self.model, s), bounds) for s, bounds in self._bounds.items()
-                }
-                self.controller.basins = self._basins
-                self.get_logger().info(
-                    'basin sampled: '
-                    + ', '.join(f'{s} {b[0]:.3f} rad' for s, b in self._bounds.items())
-                )
 
     # The loop
 
@@ -190,7 +110,8 @@ class BalanceNode(Node):
         if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
             self.controller.stop()
         self._last_ns = stamp_ns
-        self._adopt()
+        if self.controller.settings is not self.declared.values:
+            self.design.adopt(self.declared.values)
         stance = message.header.frame_id.removesuffix('_foot')
         torque, self._reason = 0.0, ''
         try:
@@ -201,11 +122,8 @@ class BalanceNode(Node):
             self.controller.stop()
             self._reason = str(error)
         else:
-            if self._basins is None and self.controller.mode != BALANCING:
-                self._reason = 'the basin of these gains is being sampled'
-            else:
-                command = self.controller.step(stamp_ns, stance, x)
-                torque, self._reason = command.torque, command.reason
+            command = self.controller.step(stamp_ns, stance, x)
+            torque, self._reason = command.torque, command.reason
         self._send(stamp_ns, torque)
 
     def _state_of(self, message: JointState) -> np.ndarray:
@@ -243,10 +161,9 @@ class BalanceNode(Node):
             self._late += age > self.declared.values.deadline
 
     def poll(self) -> float:
-        """Look after the samplers, say once a second how it goes."""
+        """Take over what was sampled, say once a second how it goes."""
         now = time.monotonic()
-        if self._samplers:
-            self._collect_basins()
+        self.design.collect()
         if now >= self._next_diagnosis:
             self._next_diagnosis = now + 1.0
             self._publish_diagnostics()
@@ -276,10 +193,8 @@ class BalanceNode(Node):
         self._late = 0
 
     def close(self) -> None:
-        """Leave with zero torque, and no sampler behind."""
-        for sampler in self._samplers.values():
-            sampler.kill()
-            sampler.wait()
+        """Leave with zero torque, and no process behind."""
+        self.design.close()
         if self._last_ns is not None:
             self._send(self._last_ns, 0.0)
 

@@ -13,14 +13,12 @@ sampled states with |z| = c(a) / MARGIN, stable coordinate within |z| and any ph
 the closed loop of the nonlinear model, friction and torque limit included, came to rest. That loop
 knows its state; MARGIN leaves room for an observer, delay and elasticity.
 
-Sampling takes some ten seconds a leg, so the basins of the default weights are shipped
-(config/balance_basins.yaml, made by bench/balance_basins.py). The node has those of
-other weights sampled in a process of its own and does not engage before they are there.
+All states of one amplitude and one bound are rolled out at once, so a leg takes a fraction of a
+second. The basins of the default weights are shipped all the same (config/balance_basins.yaml,
+made by bench/balance_basins.py): a machine without a C compiler needs minutes.
 """
 
-import argparse
-import json
-import sys
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +28,7 @@ import yaml
 
 from cg_control.linearise import linearise_stance, without_extra_states
 from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.batch import Feedback, simulate_batch
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
@@ -134,8 +133,7 @@ def sample_basin(
         seed: Of the directions.
     """
     modes = modes_of(model, stance)
-    model = without_extra_states(model)
-    caught = _Trial(model, stance, gain, torque_limit)
+    closed_loop = _ClosedLoop(model, stance, gain, torque_limit)
     bounds: list[float] = []
     for swing in SWINGS:
         rng = np.random.default_rng(seed)
@@ -146,26 +144,39 @@ def sample_basin(
         for _ in range(HALVINGS):
             z = (low + high) / 2
             states = [modes.state(sign * z, s * z, swing, phase) for sign, s, phase in shapes]
-            low, high = (z, high) if all(map(caught, states)) else (low, z)
+            low, high = (z, high) if closed_loop.catches(np.array(states)) else (low, z)
         bounds.append(low)
     return Basin(modes, tuple(round(MARGIN * bound, 5) for bound in bounds))
 
 
-class _Trial:
-    def __init__(self, model: Model, stance: str, gain: np.ndarray, torque_limit: float):
-        setup = Setup(stance=stance)
-        self.compiled, self.p = compile_model(model, setup), parameter_vector(model, setup)
-        self.gain, self.limit = np.asarray(gain, float).ravel()[:4], torque_limit
-        self.standing = STANCES.index(stance)
+class _ClosedLoop:
+    """The nonlinear model under u = clip(-K x)."""
 
-    def __call__(self, x0: np.ndarray) -> bool:
-        x, u = x0.copy(), np.ones(self.compiled.nu)
-        for _ in range(round(DURATION / SAMPLE_TIME)):
-            u[0] = min(max(-float(self.gain @ x), -self.limit), self.limit)
-            self.compiled.advance(x, u, self.p, SAMPLE_TIME / 2, 2)
-            if not abs(x[self.standing]) < FALLEN:
-                return False
-        return abs(x[self.standing]) < AT_REST and abs(x[2 + self.standing]) < AT_REST
+    def __init__(self, model: Model, stance: str, gain: np.ndarray, torque_limit: float):
+        self.model, self.setup = without_extra_states(model), Setup(stance=stance)
+        self.p = parameter_vector(self.model, self.setup)
+        self.standing = STANCES.index(stance)
+        self.time = np.arange(round(DURATION / SAMPLE_TIME) + 1) * SAMPLE_TIME
+        rows, nu = len(self.time), compile_model(self.model, self.setup).nu
+        gains = np.zeros((rows, nu, 4))
+        gains[:, 0] = np.asarray(gain, float).ravel()[:4]
+        limit = np.full(nu, np.inf)
+        limit[0] = torque_limit
+        # Inputs beside the torque are factors: one means that nothing is switched off.
+        self.u = np.ones((rows, nu))
+        self.u[:, 0] = 0.0
+        self.feedback = Feedback(gains, np.zeros((rows, 4)), limit)
+
+    def catches(self, x0: np.ndarray) -> bool:
+        """True if the robot comes to rest from all these states, shape (n, 4)."""
+        x = simulate_batch(
+            self.model, self.setup, self.time, self.u, x0, self.p,
+            trajectories=True, feedback=self.feedback,
+        )  # fmt: skip
+        lean, rate = x[:, :, self.standing], x[:, :, 2 + self.standing]
+        upright = np.abs(lean).max(axis=1) < FALLEN
+        at_rest = (np.abs(lean[:, -1]) < AT_REST) & (np.abs(rate[:, -1]) < AT_REST)
+        return bool((upright & at_rest).all())
 
 
 def shipped_file() -> Path:
@@ -178,38 +189,23 @@ def shipped_file() -> Path:
     return package.parent / name
 
 
+@functools.cache
+def _shipped_entries() -> list[dict]:
+    try:
+        return yaml.safe_load(shipped_file().read_text(encoding='utf-8'))
+    except OSError:
+        return []
+
+
 def shipped_basins(
     model: Model, gains: Mapping[str, np.ndarray], torque_limit: float
 ) -> dict[str, Basin] | None:
     """The shipped basins, if they are of this model, these gains and this limit."""
-    try:
-        entries = yaml.safe_load(shipped_file().read_text(encoding='utf-8'))
-    except OSError:
-        return None
-    for entry in entries:
-        same = entry['model_sha256'] == model.hash and entry['torque_limit'] == torque_limit
+    for entry in _shipped_entries():
+        same = entry['torque_limit'] == torque_limit and entry['model_sha256'] == model.hash
         # Gains are printed with 6 digits; a basin does not change with the seventh.
         if same and all(
             np.allclose(gains[s][:4], entry['gains'][s], rtol=1e-5, atol=1e-5) for s in STANCES
         ):
             return {s: Basin(modes_of(model, s), tuple(entry['bounds'][s])) for s in STANCES}
     return None
-
-
-def main(args: list[str] | None = None) -> int:
-    """Sample a basin and print its bounds as JSON: what the node starts as a process."""
-    parser = argparse.ArgumentParser(prog='python -m cg_control.basin', description=__doc__)
-    parser.add_argument('model', help='model file')
-    parser.add_argument('stance', choices=STANCES)
-    parser.add_argument('torque_limit', type=float, help='N m')
-    parser.add_argument('gain', type=float, nargs=4, help='K of the four states')
-    options = parser.parse_args(args)
-    basin = sample_basin(
-        Model.load(options.model), options.stance, np.array(options.gain), options.torque_limit
-    )
-    print(json.dumps(list(basin.bounds)))
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -6,7 +6,6 @@ last leg, which goes on until the next start or stop. Torque is zero at once whe
 finite, late, or that of a fallen robot.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,12 +45,9 @@ class TrajectoryController:
         self._fallen = False
         self._state: tuple[str, np.ndarray] | None = None
 
-    def adopt(
-        self, settings: ExecutionSettings, gains: Mapping[str, np.ndarray] | None = None
-    ) -> None:
-        """New settings, and gains of the balance controller with them, from the next step on."""
+    def adopt(self, settings: ExecutionSettings) -> None:
+        """New settings from the next step on; those of the balance controller are its own."""
         self.settings = settings
-        self.balance.adopt(settings, gains)
         if self._tracker is not None:
             self._tracker.settings = settings
 

@@ -11,6 +11,7 @@ import json
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -20,9 +21,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from cg_control.balance import BALANCING, WEIGHTS, BalanceController, balance_gains
-from cg_control.basin import shipped_basins
+from cg_control.balance import BALANCING, WEIGHTS
 from cg_control.execution import CAUGHT, TRACKING, ExecutionSettings, TrajectoryController
+from cg_control.live_design import LiveDesign
 from cg_control.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -63,14 +64,19 @@ class TvlqrNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, TvlqrNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        self.model = Model.load(settings.model_file or model_path(NOMINAL_MODEL))
-        gains = self._gains(settings)
-        balance = BalanceController(self.model, settings, gains)
-        balance.basins = shipped_basins(self.model, gains, balance.torque_limit)
-        self.controller = TrajectoryController(balance, self.model, settings)
+        given = settings.model_file
+        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        self.model = Model.load(path)
+        self.design = LiveDesign(
+            path,
+            self.model,
+            settings,
+            1.0 / settings.sample_rate_hz,
+            log=self.get_logger().info,
+        )
+        self.controller = TrajectoryController(self.design.controller, self.model, settings)
         self.trajectory: Trajectory | None = None
         self.problem = 'no trajectory selected yet'
-        self._adopted = settings
         self._last_ns: int | None = None
         self._reason = 'no state yet'
         self._next_diagnosis = 0.0
@@ -88,28 +94,14 @@ class TvlqrNode(Node):
         self.add_on_set_parameters_callback(self._judge)
         self.started = True
 
-    def _gains(self, settings: TvlqrNodeSettings) -> dict[str, np.ndarray]:
-        return balance_gains(self.model, settings, 1.0 / settings.sample_rate_hz)
-
     def _judge(self, parameters: list) -> SetParametersResult:
         """Refuse settings for which there is no regulator."""
         changes = {p.name: p.value for p in parameters if p.name in WEIGHTS}
         try:
-            self._gains(dataclasses.replace(self.declared.values, **changes))
+            self.design.judge(dataclasses.replace(self.declared.values, **changes))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-    def _adopt(self, settings: TvlqrNodeSettings) -> None:
-        """Take over what `ros2 param set` has changed."""
-        before, self._adopted = self._adopted, settings
-        gains = None
-        if any(getattr(settings, name) != getattr(before, name) for name in WEIGHTS):
-            gains = self._gains(settings)
-            # The basin is that of the shipped gains; with others nobody has sampled one here.
-            limit = self.controller.balance.torque_limit
-            self.controller.balance.basins = shipped_basins(self.model, gains, limit)
-        self.controller.adopt(settings, gains)
 
     def on_selected(self, message: String) -> None:
         """Take over the selected trajectory, if it is this robot's."""
@@ -156,8 +148,9 @@ class TvlqrNode(Node):
         if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
             self.controller.interrupt()
         self._last_ns = stamp_ns
-        if self._adopted is not self.declared.values:
-            self._adopt(self.declared.values)
+        if self.controller.settings is not self.declared.values:
+            self.design.adopt(self.declared.values)
+            self.controller.adopt(self.declared.values)
         try:
             stance, x = state_of(message)
         except ValueError as error:
@@ -176,8 +169,9 @@ class TvlqrNode(Node):
         self.publisher.publish(self.message)
 
     def poll(self) -> float:
-        """Say once a second how it goes."""
+        """Take over what was sampled, say once a second how it goes."""
         now = time.monotonic()
+        self.design.collect()
         if now >= self._next_diagnosis:
             self._next_diagnosis = now + 1.0
             status = DiagnosticStatus(name='tvlqr', hardware_id='torque path')
@@ -196,7 +190,8 @@ class TvlqrNode(Node):
         return 0.2
 
     def close(self) -> None:
-        """Leave with zero torque."""
+        """Leave with zero torque, and no process behind."""
+        self.design.close()
         if self._last_ns is not None:
             self._send(self._last_ns, 0.0)
 

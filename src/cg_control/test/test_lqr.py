@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from cg_control.lqr import LqrError, dlqr, lqr
 
@@ -36,6 +37,20 @@ def test_cost_to_go_is_the_cost_of_the_closed_loop():
         cost += x @ Q @ x + u @ R @ u
         x = A @ x + B @ u
     assert cost == pytest.approx(x0 @ regulator.S @ x0, rel=1e-9)
+
+
+@pytest.mark.parametrize('singular', [False, True])
+def test_sampled_regulators_are_those_of_scipy(singular):
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        n = int(rng.integers(1, 7))
+        A, B = rng.standard_normal((n, n)), rng.standard_normal((n, 2))
+        if singular:  # a state that is a copy of an input: no inverse, other route
+            A[-1] = 0.0
+        Q, R = np.diag(rng.uniform(0.1, 10.0, n)), np.diag(rng.uniform(0.1, 10.0, 2))
+        expected = solve_discrete_are(A, B, Q, R)
+        # The residual that is accepted, 1e-9, times the conditioning of such equations.
+        np.testing.assert_allclose(dlqr(A, B, Q, R).S, expected, atol=1e-7 * expected.max())
 
 
 def test_short_samples_lead_to_the_continuous_regulator():
