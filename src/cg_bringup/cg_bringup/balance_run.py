@@ -2,29 +2,32 @@
 
 Starts the simulated hardware, the observer, the balance controller and the safety gate as
 processes of their own, for machines without `ros2 launch`; balance.launch.py starts the same
-nodes with the same parameters (`balance_nodes`). Ends with the machine, or with Ctrl-C.
+nodes with the same parameters (`balance_nodes`). Ends when the time is over, the robot has fallen,
+or with Ctrl-C; the last line says whether it worked, and so does the exit status.
 """
 
 import argparse
-import signal
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from cg_bringup.runs import MODES, parameter_file_text
+from cg_bringup.balancing import FALLEN
+from cg_bringup.runs import MODES, NodeOf
+from cg_bringup.supervisor import ProcessDied, supervised
+from cg_bringup.verdict import Verdict, balance_verdict
 from cg_description.paths import model_path
 from cg_dynamics.rig import STANCES
+from cg_dynamics.stop_request import Stopped
+from cg_hardware.standing import Outcome
 
 ROBOT = 'compass_gait_flexible'
 LEAN = 0.06  # rad
-POLL = 0.05  # s
+MACHINE = 'simulation_node'
 
 
 @dataclass(frozen=True)
@@ -56,25 +59,8 @@ class BalanceOptions:
     epsilon: float = 0.2
 
 
-@dataclass(frozen=True)
-class NodeOf:
-    """A node to start.
-
-    Attributes:
-        package: Package of its executable.
-        executable: Name of executable and module.
-        parameters: ROS parameters.
-        remappings: (from, to) of topics.
-    """
-
-    package: str
-    executable: str
-    parameters: dict[str, Any]
-    remappings: tuple[tuple[str, str], ...] = ()
-
-
 def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
-    """Node name -> what to start; the machine comes last."""
+    """Node name -> what to start, in the order of ending."""
     rate = {'sample_rate_hz': 500.0}
     machine: dict[str, Any] = {
         'model_file': options.robot,
@@ -87,13 +73,14 @@ def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
         'experiment': 'balance',
         'closed_loop': True,
         'exit_when_done': True,
+        'fall_angle': FALLEN,
         **rate,
     }
     if options.pushes:
         machine['pushes'] = [float(number) for number in options.pushes]
     observer = {'model_file': options.model, 'method': options.method, 'epsilon': options.epsilon}
     return {
-        'observer': NodeOf('cg_estimation', 'observer_node', observer | rate),
+        MACHINE: NodeOf('cg_hardware', 'simulation_node', machine),
         'balance': NodeOf(
             'cg_control',
             'balance_node',
@@ -101,61 +88,54 @@ def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
             (('/torque_command', '/torque_request'),),
         ),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
-        'simulation_node': NodeOf('cg_hardware', 'simulation_node', machine),
+        'observer': NodeOf('cg_estimation', 'observer_node', observer | rate),
     }
 
 
-def start(nodes: dict[str, NodeOf], directory: Path, output=None) -> dict[str, subprocess.Popen]:
-    """Start nodes as processes; parameters go through a file in `directory`."""
-    parameters = directory / 'parameters.yaml'
-    tree = {name: node.parameters for name, node in nodes.items()}
-    parameters.write_text(parameter_file_text(tree), encoding='utf-8')
-    return {
-        name: subprocess.Popen(
-            [
-                *(sys.executable, '-m', f'{node.package}.{node.executable}', '--ros-args'),
-                *('--params-file', str(parameters)),
-                *(word for a, b in node.remappings for word in ('-r', f'{a}:={b}')),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT if output is not None else None,
-            start_new_session=True,
-        )
-        for name, node in nodes.items()
-    }
+def carry_out(
+    program: str, nodes: dict[str, NodeOf], judge: Callable[[Outcome], Verdict]
+) -> int:
+    """Run the nodes until the machine has finished, and end with one line of how it went.
 
+    Args:
+        program: Its name, for the line.
+        nodes: Node name -> what to start.
+        judge: Says whether what the robot did is what was asked.
 
-def stop(processes: dict[str, subprocess.Popen]) -> None:
-    """End processes, the controller's first, so that it leaves with zero torque."""
-    for process in processes.values():
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-    for process in processes.values():
+    Returns:
+        Exit status: 0 if it worked, 1 if not, 128 + the signal if one came.
+    """
+    with tempfile.TemporaryDirectory(prefix='cg_outcome_') as directory:
+        outcome = Path(directory) / 'outcome.json'
+        interruption: ProcessDied | Stopped | None = None
+        status = 0
         try:
-            process.wait(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            with supervised(with_outcome(nodes, outcome)) as supervisor:
+                status = supervisor.wait(MACHINE)
+        except (ProcessDied, Stopped) as error:
+            interruption = error
+        verdict = verdict_of(outcome, judge)
+    line = f'{interruption}; until then {verdict.line}' if interruption else verdict.line
+    worked = verdict.worked and status == 0 and not isinstance(interruption, ProcessDied)
+    print(f'{program}: {line}', file=sys.stdout if worked else sys.stderr, flush=True)
+    if isinstance(interruption, Stopped):
+        return interruption.status
+    return 0 if worked else 1
 
 
-def carry_out(nodes: dict[str, NodeOf]) -> int:
-    """Exit code of the machine, `simulation_node`; 1 if another node ended before it."""
-    with tempfile.TemporaryDirectory(prefix='cg_run_') as directory:
-        processes = start(nodes, Path(directory))
-        machine = processes['simulation_node']
-        try:
-            while machine.poll() is None:
-                for name, process in processes.items():
-                    if process is not machine and process.poll() is not None:
-                        print(f'error: {name} ended early', file=sys.stderr)
-                        return 1
-                time.sleep(POLL)
-            return machine.returncode
-        except KeyboardInterrupt:
-            return 130
-        finally:
-            stop(processes)
+def with_outcome(nodes: dict[str, NodeOf], outcome: Path) -> dict[str, NodeOf]:
+    """The same nodes, with a machine that writes there how the robot fared."""
+    machine = nodes[MACHINE]
+    parameters = machine.parameters | {'outcome_file': str(outcome)}
+    return nodes | {MACHINE: replace(machine, parameters=parameters)}
+
+
+def verdict_of(outcome: Path, judge: Callable[[Outcome], Verdict]) -> Verdict:
+    """What is said of a run whose machine was to write its outcome there."""
+    try:
+        return judge(Outcome.load(outcome))
+    except FileNotFoundError:
+        return Verdict(False, 'the machine had not started')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -175,7 +155,9 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--method', default='high_gain', help='of the observer [high_gain]')
     parser.add_argument('--epsilon', type=float, default=0.2, help='of the observer, s [0.2]')
     options = BalanceOptions(**vars(parser.parse_args(args)))
-    return carry_out(balance_nodes(options))
+    return carry_out(
+        'balance', balance_nodes(options), lambda o: balance_verdict(o, options.pushes)
+    )
 
 
 if __name__ == '__main__':

@@ -8,8 +8,6 @@ else, to the analysis in a process of its own, prints its verdict, and only then
 import argparse
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,9 +19,11 @@ from rich.table import Table
 from cg_bringup.experiment import run_experiment
 from cg_bringup.hidden import Hidden, hide
 from cg_bringup.runs import NOMINAL_MODEL, Run
+from cg_bringup.supervisor import Supervisor
 from cg_description.paths import model_path
 from cg_dynamics.domains import own_domain
 from cg_dynamics.model import Model
+from cg_dynamics.stop_request import Stopped, stopped_by_signals
 from cg_sysid.experiments import ExperimentError, load_experiment
 
 # The last repeats the first with another excitation.
@@ -71,12 +71,11 @@ def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> di
     Raises:
         ExperimentError: It failed.
     """
-    program = 'import sys; from cg_sysid.diagnose_cli import main; sys.exit(main())'
-    command = [sys.executable, '-c', program]
-    command += ['--model', str(nominal), '--out', str(out), *map(str, bags)]
+    analysis = ['cg_sysid.diagnose_cli', '--model', str(nominal), '--out', str(out)]
     console.print('[bold]Diagnosing[/] from these bags and the nominal model, nothing else')
     start = time.monotonic()
-    status = subprocess.run(command, check=False).returncode
+    with Supervisor({'analysis': [*analysis, *map(str, bags)]}) as supervisor:
+        status = supervisor.wait('analysis')
     result = out / 'diagnosis.json'
     if status != 0 or not result.is_file():
         raise ExperimentError(f'the analysis ended with status {status}')
@@ -145,13 +144,14 @@ def main(args: list[str] | None = None) -> int:
     console = Console(highlight=False)
     console.print(f'[bold]Demonstration[/], seed {seed}: a machine with a secret')
     try:
-        run_demo(options.effect, seed, out, options.duration, console)
+        with stopped_by_signals():
+            run_demo(options.effect, seed, out, options.duration, console)
     except (ValueError, RuntimeError, OSError) as error:
         console.print(f'error: {error}', markup=False, style='red')
         return 1
-    except KeyboardInterrupt:
-        console.print('interrupted')
-        return 130
+    except Stopped as stopped:
+        console.print(str(stopped))
+        return stopped.status
     return 0
 
 

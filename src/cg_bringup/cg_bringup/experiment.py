@@ -5,26 +5,24 @@ for the machine to finish, shuts the others down, checks the bag and prints its 
 """
 
 import argparse
-import contextlib
-import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import yaml
 
-from cg_bringup.runs import MODES, NODE_MODULES, Run, node_parameters, parameter_file_text
+from cg_bringup.runs import MODES, Run, experiment_nodes
+from cg_bringup.supervisor import ProcessDied, supervised
+from cg_dynamics.stop_request import Stopped
 from cg_sysid.experiments import ExperimentError, experiment_names, load_experiment
 
 RATE_HZ = 500.0
 START_UP = 60.0  # s that processes and discovery may take on a busy machine
 SLOWEST = 8.0  # s that a lock-step run may take per simulated s
-CLOSING = 120.0  # s that the recorder may take to close its bag
-POLL = 0.02  # s
 
 
 @dataclass(frozen=True)
@@ -52,81 +50,34 @@ def run_experiment(run: Run, on_wait: Callable[[], None] = lambda: None) -> Reco
     Raises:
         ExperimentError: A node failed or the bag is not what it should be; the message ends
             with what the nodes said.
+        Stopped: A signal came; the nodes have ended, and the bag holds what there was until then.
     """
     if run.bag.exists():
         raise ExperimentError(f'{run.bag} exists already; recordings are never overwritten')
     run.bag.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix='cg_experiment_') as directory:
-        parameters = Path(directory) / 'parameters.yaml'
-        parameters.write_text(parameter_file_text(node_parameters(run)), encoding='utf-8')
-        log = Path(directory) / 'log'
+    with tempfile.TemporaryFile('w+') as log:
         try:
-            with log.open('w') as output, _nodes(parameters, output) as nodes:
-                _wait_for_machine(nodes, run, on_wait)
-                _end(nodes)
+            _carry_out(run, on_wait, log)
             counts = check_counts(run)
         except ExperimentError as error:
-            said = log.read_text(encoding='utf-8', errors='replace').strip()
+            log.seek(0)
+            said = log.read().strip()
             raise ExperimentError(f'{run.experiment.name}: {error}\n{said}') from None
     return Recorded(run.bag, counts, time.monotonic() - start)
 
 
-@contextlib.contextmanager
-def _nodes(parameters: Path, output) -> Iterator[dict[str, subprocess.Popen]]:
-    nodes: dict[str, subprocess.Popen] = {}
-    try:
-        for name, (package, module) in NODE_MODULES.items():
-            nodes[name] = subprocess.Popen(
-                [
-                    *(sys.executable, '-m', f'{package}.{module}'),
-                    *('--ros-args', '--params-file', str(parameters)),
-                ],
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                # Ctrl-C reaches this process alone, which then ends its nodes in order.
-                start_new_session=True,
-            )
-        yield nodes
-    finally:
-        for node in nodes.values():
-            if node.poll() is None:
-                node.send_signal(signal.SIGINT)
-        for node in nodes.values():
-            try:
-                node.wait(timeout=10.0)
-            except subprocess.TimeoutExpired:
-                node.kill()
-                node.wait()
-
-
-def _wait_for_machine(
-    nodes: dict[str, subprocess.Popen], run: Run, on_wait: Callable[[], None]
-) -> None:
+def _carry_out(run: Run, on_wait: Callable[[], None], log: IO) -> None:
     pace = SLOWEST if run.mode == 'lockstep' else 1.0
-    deadline = time.monotonic() + START_UP + pace * run.length
-    machine = nodes['simulation_node']
-    while machine.poll() is None:
-        on_wait()
-        for name, node in nodes.items():
-            if node is not machine and node.poll() is not None:
-                raise ExperimentError(f'{name} ended early with status {node.returncode}')
-        if time.monotonic() > deadline:
-            raise ExperimentError(f'not finished {START_UP + pace * run.length:.0f} s after start')
-        time.sleep(POLL)
-    if machine.returncode != 0:
-        raise ExperimentError(f'the machine gave up with status {machine.returncode}')
-
-
-def _end(nodes: dict[str, subprocess.Popen]) -> None:
-    for name in ('excitation', 'recorder'):
-        nodes[name].send_signal(signal.SIGINT)
-    for name in ('excitation', 'recorder'):
-        try:
-            status = nodes[name].wait(timeout=CLOSING)
-        except subprocess.TimeoutExpired:
-            raise ExperimentError(f'{name} does not end') from None
+    try:
+        with supervised(experiment_nodes(run), log) as supervisor:
+            status = supervisor.wait('simulation_node', START_UP + pace * run.length, on_wait)
+            statuses = supervisor.end()
+    except (ProcessDied, TimeoutError) as error:
+        raise ExperimentError(str(error)) from None
+    if status != 0:
+        raise ExperimentError(f'the machine gave up with status {status}')
+    for name, status in statuses.items():
         if status != 0:
             raise ExperimentError(f'{name} ended with status {status}')
 
@@ -182,6 +133,10 @@ def main(args: list[str] | None = None) -> int:
     except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
+    except Stopped as stopped:
+        left = f'; {run.bag} holds what was recorded until then' if run.bag.exists() else ''
+        print(f'{stopped}{left}', file=sys.stderr)
+        return stopped.status
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130

@@ -3,7 +3,8 @@
 The robot balances on one leg, takes a step when it has stood for a second, is caught on the other
 leg and balances there. Starts the simulated hardware off its blocks, the observer, the trajectory
 server, the TVLQR controller and the safety gate as processes of their own, for machines without
-`ros2 launch`; rebalance.launch.py starts the same nodes with the same parameters.
+`ros2 launch`; rebalance.launch.py starts the same nodes with the same parameters. The last line
+says whether it worked, and so does the exit status.
 """
 
 import argparse
@@ -12,8 +13,10 @@ from typing import Any
 
 import yaml
 
-from cg_bringup.balance_run import NodeOf, carry_out
-from cg_bringup.runs import MODES
+from cg_bringup.balance_run import MACHINE, carry_out
+from cg_bringup.balancing import FALLEN
+from cg_bringup.runs import MODES, NodeOf
+from cg_bringup.verdict import rebalance_verdict
 from cg_control.tracking import REMEDIES
 from cg_description.paths import model_path
 from cg_dynamics.rig import STANCES
@@ -49,7 +52,7 @@ class RebalanceOptions:
 
 
 def rebalance_nodes(options: RebalanceOptions) -> dict[str, NodeOf]:
-    """Node name -> what to start; the machine comes last."""
+    """Node name -> what to start, in the order of ending."""
     rate = {'sample_rate_hz': 500.0}
     second = next(leg for leg in STANCES if leg != options.first)
     machine: dict[str, Any] = {
@@ -62,32 +65,28 @@ def rebalance_nodes(options: RebalanceOptions) -> dict[str, NodeOf]:
         'await_answer': True,
         'experiment': 'one_step_rebalance',
         'exit_when_done': True,
+        'fall_angle': FALLEN,
         **rate,
     }
+    planner = {
+        'model_file': options.model,
+        'trajectory': f'{options.first}_to_{second}',
+        'friction': options.friction,
+    }
+    controller = {
+        'model_file': options.model,
+        'remedy': options.remedy,
+        'start_after': options.start_after,
+        **rate,
+    }
+    observer = {'model_file': options.model}
+    remapped = (('/torque_command', '/torque_request'),)
     return {
-        'observer': NodeOf('cg_estimation', 'observer_node', {'model_file': options.model}),
-        'trajectory_server': NodeOf(
-            'cg_control',
-            'trajectory_server_node',
-            {
-                'model_file': options.model,
-                'trajectory': f'{options.first}_to_{second}',
-                'friction': options.friction,
-            },
-        ),
-        'tvlqr': NodeOf(
-            'cg_control',
-            'tvlqr_node',
-            {
-                'model_file': options.model,
-                'remedy': options.remedy,
-                'start_after': options.start_after,
-                **rate,
-            },
-            (('/torque_command', '/torque_request'),),
-        ),
+        MACHINE: NodeOf('cg_hardware', 'simulation_node', machine),
+        'trajectory_server': NodeOf('cg_control', 'trajectory_server_node', planner),
+        'tvlqr': NodeOf('cg_control', 'tvlqr_node', controller, remapped),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
-        'simulation_node': NodeOf('cg_hardware', 'simulation_node', machine),
+        'observer': NodeOf('cg_estimation', 'observer_node', observer),
     }
 
 
@@ -108,7 +107,10 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--seed', type=int, default=1, help='of the sensor noise [1]')
     parser.add_argument('--duration', type=float, default=6.0, help='in s, 0 for ever [6]')
     options = RebalanceOptions(**vars(parser.parse_args(args)))
-    return carry_out(rebalance_nodes(options))
+    asked = options.start_after > 0.0
+    return carry_out(
+        'rebalance', rebalance_nodes(options), lambda o: rebalance_verdict(o, options.first, asked)
+    )
 
 
 if __name__ == '__main__':

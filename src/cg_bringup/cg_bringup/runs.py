@@ -1,6 +1,6 @@
-"""How an experiment is carried out: the parameters of its three nodes.
+"""What is started: a node with its parameters, and the three nodes of an experiment.
 
-For the runner and for the launch files alike. No ROS here.
+For the runners and for the launch files alike. No ROS here.
 """
 
 from collections.abc import Mapping
@@ -17,6 +17,27 @@ from cg_sysid.experiments import Experiment, ExperimentError
 
 MODES = ('lockstep', 'real_time')
 NOMINAL_MODEL = 'compass_gait_mit'
+ENDING = 5.0  # s that a node has to end in when it is told to
+CLOSING = 120.0  # s that the recorder may take to close its bag
+
+
+@dataclass(frozen=True)
+class NodeOf:
+    """A node to start.
+
+    Attributes:
+        package: Package of its executable.
+        executable: Name of executable and module.
+        parameters: ROS parameters.
+        remappings: (from, to) of topics.
+        ending: Time in s that it has to end in when it is told to.
+    """
+
+    package: str
+    executable: str
+    parameters: dict[str, Any]
+    remappings: tuple[tuple[str, str], ...] = ()
+    ending: float = ENDING
 
 
 @dataclass(frozen=True)
@@ -56,48 +77,44 @@ class Run:
         return self.model_file or model_path(NOMINAL_MODEL)
 
 
-def node_parameters(run: Run) -> dict[str, dict[str, Any]]:
-    """Node name -> its ROS parameters."""
+def experiment_nodes(run: Run) -> dict[str, NodeOf]:
+    """Node name -> what to start, in the order of ending: the recorder hears the last words."""
     mechanism = Model.load(run.model_path).mechanism.name
     experiment = run.experiment
+    excitation = {
+        **experiment.excitation,
+        'duration': run.length,
+        'seed': run.seed,
+        'measurement_topic': MEASUREMENT[mechanism],
+        'joints': list(joints_of(mechanism)),
+        'frame_id': TORQUE_FRAME[mechanism],
+        'listeners': 2,
+    }
+    machine = {
+        'model_file': str(run.model_path),
+        'note_model_file': str(run.note_model_file or ''),
+        'setup': yaml.safe_dump(experiment.setup.to_dict()),
+        'seed': run.seed,
+        'mode': run.mode,
+        'initial_state': list(experiment.initial_state),
+        'duration': run.length,
+        'recorders': 1,
+        'experiment': experiment.name,
+        'exit_when_done': True,
+    }
+    recorder = {
+        'bag': str(run.bag),
+        'mechanism': mechanism,
+        'time': 'stamp' if run.mode == 'lockstep' else 'receipt',
+    }
     return {
-        'simulation_node': {
-            'model_file': str(run.model_path),
-            'note_model_file': str(run.note_model_file or ''),
-            'setup': yaml.safe_dump(experiment.setup.to_dict()),
-            'seed': run.seed,
-            'mode': run.mode,
-            'initial_state': list(experiment.initial_state),
-            'duration': run.length,
-            'recorders': 1,
-            'experiment': experiment.name,
-            'exit_when_done': True,
-        },
-        'excitation': {
-            **experiment.excitation,
-            'duration': run.length,
-            'seed': run.seed,
-            'measurement_topic': MEASUREMENT[mechanism],
-            'joints': list(joints_of(mechanism)),
-            'frame_id': TORQUE_FRAME[mechanism],
-            'listeners': 2,
-        },
-        'recorder': {
-            'bag': str(run.bag),
-            'mechanism': mechanism,
-            'time': 'stamp' if run.mode == 'lockstep' else 'receipt',
-        },
+        'simulation_node': NodeOf('cg_hardware', 'simulation_node', machine),
+        'excitation': NodeOf('cg_sysid', 'excitation_node', excitation),
+        'recorder': NodeOf('cg_sysid', 'recorder_node', recorder, ending=CLOSING),
     }
 
 
-NODE_MODULES = {
-    'recorder': ('cg_sysid', 'recorder_node'),
-    'excitation': ('cg_sysid', 'excitation_node'),
-    'simulation_node': ('cg_hardware', 'simulation_node'),
-}
-
-
-def parameter_file_text(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    """The text of a ROS parameter file."""
-    tree = {node: {'ros__parameters': dict(values)} for node, values in parameters.items()}
+def parameter_file_text(nodes: Mapping[str, NodeOf]) -> str:
+    """The text of a ROS parameter file for these nodes."""
+    tree = {name: {'ros__parameters': dict(node.parameters)} for name, node in nodes.items()}
     return yaml.safe_dump(tree, sort_keys=False)

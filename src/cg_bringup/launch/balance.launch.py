@@ -3,21 +3,17 @@
     ros2 launch cg_bringup balance.launch.py stance:=outer pushes:='[5.0, 0.3, 8.0, -0.3]'
 
 The same nodes as `ros2 run cg_bringup balance`. Tune them while they run:
-`ros2 param set /observer epsilon 0.05`, `ros2 param set /balance lean_scale 0.1`.
+`ros2 param set /observer epsilon 0.05`, `ros2 param set /balance lean_scale 0.1`. The exit code is
+0 if the robot stood to the end, 1 if it fell or a node died.
 """
 
-import tempfile
-
 import yaml
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch import LaunchDescription
 
 from cg_bringup.balance_run import BalanceOptions, balance_nodes
-from cg_bringup.runs import MODES, parameter_file_text
+from cg_bringup.launching import description, node_actions, number
+from cg_bringup.runs import MODES
+from cg_bringup.verdict import balance_verdict
 from cg_dynamics.rig import STANCES
 
 DEFAULT = BalanceOptions()
@@ -35,42 +31,25 @@ ARGUMENTS = {
 }
 
 
-def start_nodes(context: LaunchContext) -> list:
+def pushes_of(text: str) -> list[float]:
+    """Instants and impulses of a list in YAML."""
+    try:
+        return [float(number) for number in yaml.safe_load(text) or []]
+    except (yaml.YAMLError, TypeError, ValueError):
+        raise ValueError(f'pushes is {text!r}; [t1, P1, t2, P2, ...] is needed') from None
+
+
+def start(given: dict[str, str]) -> list:
     """The nodes that the arguments describe."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     options = BalanceOptions(
         **{name: given[name] for name in ('robot', 'model', 'stance', 'mode', 'method')},
-        **{name: float(given[name]) for name in ('lean', 'duration', 'epsilon')},
-        seed=int(given['seed']),
-        pushes=yaml.safe_load(given['pushes']) or (),
+        **{name: number(given, name) for name in ('lean', 'duration', 'epsilon')},
+        seed=number(given, 'seed', int),
+        pushes=pushes_of(given['pushes']),
     )
-    nodes = balance_nodes(options)
-    with tempfile.NamedTemporaryFile('w', suffix='.yaml', delete=False) as file:
-        file.write(parameter_file_text({name: node.parameters for name, node in nodes.items()}))
-    actions = {
-        name: Node(
-            package=node.package,
-            executable=node.executable,
-            name=name,
-            parameters=[file.name],
-            remappings=list(node.remappings),
-            output='screen',
-        )
-        for name, node in nodes.items()
-    }
-    finished = RegisterEventHandler(
-        OnProcessExit(
-            target_action=actions['simulation_node'],
-            on_exit=[EmitEvent(event=Shutdown(reason='the machine has finished'))],
-        )
-    )
-    return [*actions.values(), finished]
+    return node_actions(balance_nodes(options), lambda o: balance_verdict(o, options.pushes))
 
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments and nodes."""
-    arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
-        for name, (default, text, choices) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start_nodes)])
+    return description(ARGUMENTS, start)

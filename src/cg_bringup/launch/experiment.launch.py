@@ -3,20 +3,15 @@
     ros2 launch cg_bringup experiment.launch.py experiment:=chirp bag:=/tmp/chirp seed:=2
 
 The same data as `ros2 run cg_bringup experiment`, for people who launch. When the machine has
-finished, the launch ends and the recorder closes its bag.
+finished, the launch ends and the recorder closes its bag. The exit code is 1 if a node died.
 """
 
-import tempfile
 from pathlib import Path
 
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch import LaunchDescription
 
-from cg_bringup.runs import MODES, NODE_MODULES, Run, node_parameters, parameter_file_text
+from cg_bringup.launching import description, node_actions, number
+from cg_bringup.runs import MODES, Run, experiment_nodes
 from cg_sysid.experiments import experiment_names, load_experiment
 
 ARGUMENTS = {
@@ -29,47 +24,21 @@ ARGUMENTS = {
 }
 
 
-def start_nodes(context: LaunchContext) -> list:
+def start(given: dict[str, str]) -> list:
     """The nodes of the experiment that the arguments describe."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     experiment = load_experiment(given['experiment'])
     bag = given['bag'] or f'bags/{experiment.name}_seed{given["seed"]}'
     run = Run(
         experiment,
         bag=Path(bag).expanduser().resolve(),
         model_file=Path(given['model']).expanduser().resolve() if given['model'] else None,
-        seed=int(given['seed']),
+        seed=number(given, 'seed', int),
         mode=given['mode'],
-        duration=float(given['duration']) or None,
+        duration=number(given, 'duration') or None,
     )
-    with tempfile.NamedTemporaryFile('w', suffix='.yaml', delete=False) as file:
-        file.write(parameter_file_text(node_parameters(run)))
-    nodes = {
-        name: Node(
-            package=package,
-            executable=executable,
-            name=name,
-            parameters=[file.name],
-            output='screen',
-            # A recorder that closes a long bag needs its time.
-            sigterm_timeout='60',
-            sigkill_timeout='60',
-        )
-        for name, (package, executable) in NODE_MODULES.items()
-    }
-    finished = RegisterEventHandler(
-        OnProcessExit(
-            target_action=nodes['simulation_node'],
-            on_exit=[EmitEvent(event=Shutdown(reason='the experiment is over'))],
-        )
-    )
-    return [*nodes.values(), finished]
+    return node_actions(experiment_nodes(run))
 
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments and nodes."""
-    arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
-        for name, (default, text, choices) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start_nodes)])
+    return description(ARGUMENTS, start)

@@ -4,20 +4,16 @@
     ros2 launch cg_bringup rebalance.launch.py start_after:=0
     ros2 service call /trajectory_server/start std_srvs/srv/Trigger
 
-The same nodes as `ros2 run cg_bringup rebalance`.
+The same nodes as `ros2 run cg_bringup rebalance`. The exit code is 0 if the robot stands on the
+other leg at the end, 1 if it does not or a node died.
 """
 
-import tempfile
+from launch import LaunchDescription
 
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction, RegisterEventHandler
-from launch.event_handlers import OnProcessExit
-from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-
+from cg_bringup.launching import description, node_actions, number
 from cg_bringup.rebalance_run import RebalanceOptions, rebalance_nodes
-from cg_bringup.runs import MODES, parameter_file_text
+from cg_bringup.runs import MODES
+from cg_bringup.verdict import rebalance_verdict
 from cg_control.tracking import REMEDIES
 from cg_dynamics.rig import STANCES
 
@@ -35,42 +31,20 @@ ARGUMENTS = {
 }
 
 
-def start_nodes(context: LaunchContext) -> list:
+def start(given: dict[str, str]) -> list:
     """The nodes that the arguments describe."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     options = RebalanceOptions(
         **{name: given[name] for name in ('robot', 'model', 'first', 'remedy', 'mode')},
-        **{name: float(given[name]) for name in ('start_after', 'duration')},
+        **{name: number(given, name) for name in ('start_after', 'duration')},
         friction=given['friction'] == 'true',
-        seed=int(given['seed']),
+        seed=number(given, 'seed', int),
     )
-    nodes = rebalance_nodes(options)
-    with tempfile.NamedTemporaryFile('w', suffix='.yaml', delete=False) as file:
-        file.write(parameter_file_text({name: node.parameters for name, node in nodes.items()}))
-    actions = {
-        name: Node(
-            package=node.package,
-            executable=node.executable,
-            name=name,
-            parameters=[file.name],
-            remappings=list(node.remappings),
-            output='screen',
-        )
-        for name, node in nodes.items()
-    }
-    finished = RegisterEventHandler(
-        OnProcessExit(
-            target_action=actions['simulation_node'],
-            on_exit=[EmitEvent(event=Shutdown(reason='the machine has finished'))],
-        )
+    asked = options.start_after > 0.0
+    return node_actions(
+        rebalance_nodes(options), lambda o: rebalance_verdict(o, options.first, asked)
     )
-    return [*actions.values(), finished]
 
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments and nodes."""
-    arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
-        for name, (default, text, choices) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start_nodes)])
+    return description(ARGUMENTS, start)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cg_bringup.runs import Run, node_parameters, parameter_file_text
+from cg_bringup.runs import Run, experiment_nodes, parameter_file_text
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
@@ -91,7 +91,7 @@ def test_a_wrong_file_is_refused_with_its_reason(tmp_path, change, message):
 
 def test_parameters_reach_the_nodes_as_they_are_declared():
     run = Run(load_experiment('chirp'), bag='/tmp/b', seed=7, duration=3.0)
-    tree = yaml.safe_load(parameter_file_text(node_parameters(run)))
+    tree = yaml.safe_load(parameter_file_text(experiment_nodes(run)))
     machine = tree['simulation_node']['ros__parameters']
     assert machine['seed'] == tree['excitation']['ros__parameters']['seed'] == 7
     assert machine['duration'] == 3.0

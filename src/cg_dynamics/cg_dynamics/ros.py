@@ -13,7 +13,6 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
 """
 
 import dataclasses
-import signal
 import sys
 import time
 import typing
@@ -36,6 +35,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from cg_dynamics.settings import Settings, describe
+from cg_dynamics.stop_request import StopRequest, end_at_once, end_with_parent
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # A publisher keeps a second of its samples: a listener that a busy machine held up gets them all.
@@ -180,22 +180,25 @@ class Throttled:
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
-    """Make a node and spin it until SIGINT, SIGTERM or its own `finished`.
+    """Make a node and spin it until it is told to stop (stop_request.py) or has `finished`.
 
     Returns:
         Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for settings
         that are refused.
     """
+    # Until the node stands it has sent nothing: there is nothing that it must leave in order.
+    end_at_once()
+    end_with_parent()
     # rclpy's own handlers would shut the context down before the node can send its last torque.
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # arguments that rcl cannot parse
         print(f'error: {error}', file=sys.stderr)
         return 2
-    stop = StopRequest()
     try:
         try:
             node = make_node()
+            stop = StopRequest()
         except (ValueError, OSError, ParameterException) as error:
             print(f'error: {error}', file=sys.stderr)
             return 2
@@ -224,15 +227,3 @@ def spin(node: Node, stopped: Callable[[], bool]) -> None:
     while time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.01)
     executor.remove_node(node)
-
-
-class StopRequest:
-    """Set by SIGINT or SIGTERM, even where the parent shell made the process ignore them."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, number: int, frame: Any) -> None:
-        self.requested = True

@@ -87,6 +87,16 @@ class SimulationSettings(Settings):
     minimum_step: float = setting(
         0.1, 'set-up with on_blocks false: least step that lands', unit='m', minimum=0.0
     )
+    fall_angle: float = setting(
+        0.0,
+        'compass gait with both legs free: lean of the stance leg at which the robot has fallen, '
+        'which ends the run; 0: it never has',
+        unit='rad',
+        minimum=0.0,
+    )
+    outcome_file: str = setting(
+        '', 'with fall_angle: file that gets how the robot fared, as JSON; empty for none'
+    )
     experiment: str = setting('', 'name of the experiment, for the recording note')
     note_model_file: str = setting(
         '',
@@ -151,6 +161,21 @@ def build_plant(settings: SimulationSettings, model: Model, setup: Setup) -> Pla
         seed=settings.seed,
         minimum_step=settings.minimum_step,
     )
+
+
+def check_fall_angle(settings: SimulationSettings, mechanism: str, setup: Setup) -> None:
+    """Refuse a fall angle for a machine that has no stance leg to lean.
+
+    Raises:
+        ValueError: naming what it is instead.
+    """
+    if settings.fall_angle == 0.0:
+        return
+    if mechanism != 'compass_gait' or setup.fixture != 'none':
+        raise ValueError(
+            f'fall_angle is {settings.fall_angle:g} rad, which needs a compass gait with both '
+            f'legs free; this is a {mechanism} with fixture {setup.fixture}'
+        )
 
 
 def noise_variances(model: Model) -> dict[str, float]:

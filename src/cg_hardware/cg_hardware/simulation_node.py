@@ -13,6 +13,7 @@ lockstep    The measurement stamped t goes out, then nothing moves until the com
 import math
 import time
 from datetime import datetime, timezone
+from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -22,6 +23,7 @@ from std_msgs.msg import Header, String
 
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
 from cg_dynamics.ros import (
     IDLE_POLL,
     LATCHED_QOS,
@@ -41,12 +43,14 @@ from cg_hardware.simulation import (
     Pace,
     SimulationSettings,
     build_plant,
+    check_fall_angle,
     model_file_of,
     noise_variances,
     read_setup,
     recording_note,
     ticks_of,
 )
+from cg_hardware.standing import Standing
 
 RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
 LATE = 0.02  # s behind the clock that are worth a warning
@@ -75,6 +79,7 @@ class SimulationNode(LifecycleNode):
         self._warn_late = Throttled(self.get_logger().warning)
         self._eavesdropper = None
         self._silent_ghosts = False
+        self.standing = None
         if self.settings.autostart:
             self._start()
 
@@ -96,6 +101,7 @@ class SimulationNode(LifecycleNode):
             model = Model.load(model_file_of(self.settings.model_file))
             setup = read_setup(self.settings.setup)
             mechanism = model.mechanism.name
+            check_fall_angle(self.settings, mechanism, setup)
             self.make_plant = lambda: build_plant(self.settings, model, setup)
             plant = self.make_plant()
             sensors = SensorPublishers(self, mechanism, noise_variances(model))
@@ -143,6 +149,10 @@ class SimulationNode(LifecycleNode):
         self.gate.drop('no command yet')
         self.progress.clear()
         self._silent_ghosts = False
+        self.standing = None
+        if self.settings.fall_angle > 0.0:
+            sample_time = 1.0 / self.settings.sample_rate_hz
+            self.standing = Standing(self.settings.fall_angle, self.plant.stance, sample_time)
         self.phase = 'gathering'
         self._deadline = time.monotonic() + self.settings.peer_timeout
         return super().on_activate(state)
@@ -286,7 +296,18 @@ class SimulationNode(LifecycleNode):
             self._fail(str(error))
             return False
         self.ticks += 1
-        return True
+        return self._stands()
+
+    def _stands(self) -> bool:
+        """False if the robot has just fallen, which ends the run."""
+        plant = self.plant
+        if self.standing is None:
+            return True
+        lean = plant.state[STANCES.index(plant.stance)]
+        if self.standing.see(plant.time, plant.stance, lean):
+            return True
+        self._fail(f'the robot fell at {plant.time:.3f} s')
+        return False
 
     # Real time
 
@@ -471,10 +492,12 @@ class SimulationNode(LifecycleNode):
         self._faults = 0
 
     def close(self) -> None:
-        """Leave with zero torque, and say so on the topic."""
+        """Leave with zero torque, say so on the topic, and how the robot fared in its file."""
         if self.phase == 'running':
             self.sensors.publish_applied(self._stamp(), (0.0,) * len(self.joints))
         self._stop()
+        if self.standing is not None and self.settings.outcome_file:
+            self.standing.outcome.save(Path(self.settings.outcome_file).expanduser())
 
 
 def main(args: list[str] | None = None) -> int:
