@@ -6,9 +6,10 @@ the others down at once and exits with 1.
 """
 
 import atexit
-import os
+import shlex
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,6 +34,7 @@ from cg_dynamics.stop_request import ON_STDIN
 from cg_hardware.standing import Outcome
 
 TOLD = (0, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a node that was told to end
+PREFIX = f' {shlex.quote(sys.executable)} -m cg_dynamics.stop_request'
 # Name -> default, description, and the values allowed or None for any.
 Arguments = Mapping[str, tuple[str, str, list[str] | None]]
 
@@ -100,6 +102,7 @@ def node_actions(
             output='screen',
             # `ros2 launch` keeps the other end of its nodes' standard input.
             additional_env=ON_STDIN,
+            prefix=[LaunchConfiguration('launch-prefix', default=''), PREFIX],
             sigterm_timeout=str(node.ending),
             sigkill_timeout=str(node.ending),
         )
@@ -118,14 +121,12 @@ def node_actions(
                 launch.logging.get_logger(MACHINE).info(verdict().line)
             return None
         if name != MACHINE or event.returncode != 0:
-            _terminate(actions.values())
             reason = f'{name} ended with exit code {event.returncode}'
             if name == MACHINE and judge is not None:
                 reason = f'{reason}: {verdict().line}'
             raise RequiredProcessDied(reason)
         found = verdict()
         if not found.worked:
-            _terminate(actions.values())
             raise RequiredProcessDied(found.line)
         launch.logging.get_logger(MACHINE).info(found.line)
         return [Shutdown(reason=found.line)]
@@ -136,11 +137,3 @@ def node_actions(
     ]
     # Handlers first: a node may die before the next action is visited.
     return [*handlers, *actions.values()]
-
-
-def _terminate(actions) -> None:
-    """SIGTERM before the SIGINT of the launch, which makes a Python that imports say a lot."""
-    for action in actions:
-        details = action.process_details or {}
-        if 'pid' in details and action.return_code is None:
-            os.kill(details['pid'], signal.SIGTERM)

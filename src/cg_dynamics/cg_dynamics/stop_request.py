@@ -10,10 +10,10 @@ leaves a gap between fork and prctl, and `ros2 launch` offers no place to call i
 gap, it survives the re-exec with which the ROS wheels start Python, and `ros2 launch` gives its
 nodes one as it is. A node that was started by hand has no LIFELINE and reads nothing.
 
-    python -m cg_dynamics.stop_request MODULE ARGS...
+    python -m cg_dynamics.stop_request MODULE_OR_SCRIPT ARGS...
 
-runs a module that holds its lifeline, and ends without a traceback, from before its imports on,
-which take seconds on a busy machine.
+runs a node that holds its lifeline, and ends without a traceback, from before its imports on, which
+take seconds on a busy machine.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from typing import Any
 LIFELINE = 'CG_LIFELINE'
 ON_STDIN = {LIFELINE: 'stdin'}  # added to the environment of a process that has a lifeline
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-GRACE = 1.0  # s that a process has to end by itself once its lifeline is cut
+GRACE = 1.5  # s that a process has to end by itself once its lifeline is cut
 
 
 class Stopped(KeyboardInterrupt):
@@ -140,4 +140,7 @@ if __name__ == '__main__':
     end_at_once()
     end_with_parent()
     del sys.argv[0]
-    runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
+    if os.sep in sys.argv[0]:
+        runpy.run_path(sys.argv[0], run_name='__main__')
+    else:
+        runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)
