@@ -9,7 +9,6 @@ import os
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -17,7 +16,8 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from cg_bringup.balance_run import BalanceOptions, balance_nodes, start, stop
+from cg_bringup.balance_run import MACHINE, BalanceOptions, balance_nodes
+from cg_bringup.supervisor import supervised
 from cg_dynamics.domains import own_domain
 from cg_dynamics.rig import STANCES
 from cg_dynamics.ros import MACHINE_QOS
@@ -39,13 +39,13 @@ def run(stance: str, seconds: float) -> tuple[dict[str, str], int, int, str]:
     node.create_subscription(JointState, '/applied_torque', torques.append, MACHINE_QOS)
     executor = EventsExecutor()
     executor.add_node(node)
-    with tempfile.TemporaryDirectory() as folder, (Path(folder) / 'log').open('w') as log:
-        options = BalanceOptions(stance=stance, lean=0.03, duration=seconds)
-        processes = start(balance_nodes(options), Path(folder), log)
+    options = BalanceOptions(stance=stance, lean=0.03, duration=seconds)
+    with tempfile.TemporaryFile() as log, supervised(balance_nodes(options), log) as supervisor:
+        machine = supervisor.processes[MACHINE]
         deadline = time.monotonic() + seconds + 60.0
-        while processes['simulation_node'].poll() is None and time.monotonic() < deadline:
+        while machine.poll() is None and time.monotonic() < deadline:
+            supervisor.stop.check()
             executor.spin_once(timeout_sec=0.05)
-        stop(processes)
     executor.remove_node(node)
     node.destroy_node()
     return last, sum(missed), len(torques), said[0]

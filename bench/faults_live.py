@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,7 +27,9 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from cg_bringup.balance_run import BalanceOptions, NodeOf, balance_nodes, start, stop
+from cg_bringup.balance_run import BalanceOptions, balance_nodes
+from cg_bringup.runs import NodeOf
+from cg_bringup.supervisor import supervised
 from cg_description.model_file import write_atomically
 from cg_dynamics.domains import own_domain
 from cg_dynamics.ros import MACHINE_QOS, SENSOR_QOS, to_nanoseconds, to_stamp
@@ -85,12 +87,14 @@ class Loop:
     directory: Path
     ear: Ear
     nodes: dict[str, NodeOf]
+    contexts: ExitStack
     processes: dict[str, subprocess.Popen] = field(default_factory=dict)
 
     def begin(self, name: str) -> None:
         """Start one node, again if need be."""
         with (self.directory / 'log').open('a') as log:
-            self.processes |= start({name: self.nodes[name]}, self.directory / name, log)
+            one = supervised({name: self.nodes[name]}, log)
+            self.processes |= self.contexts.enter_context(one).processes
 
 
 @contextmanager
@@ -105,10 +109,10 @@ def running(directory: Path, recorded: bool = False) -> Iterator[Loop]:
         if recorded:
             bag = {'bag': str(directory / 'bag')}
             nodes = {'recorder': NodeOf('cg_sysid', 'recorder_node', bag)} | nodes
-        loop = Loop(directory, ear, nodes)
+        contexts = ExitStack()
+        loop = Loop(directory, ear, nodes, contexts)
         try:
             for name in nodes:
-                (directory / name).mkdir()
                 loop.begin(name)
             if not ear.until(ear.driven, 60.0):
                 raise RuntimeError((directory / 'log').read_text())
@@ -117,7 +121,7 @@ def running(directory: Path, recorded: bool = False) -> Iterator[Loop]:
             for process in loop.processes.values():
                 if process.poll() is None:
                     process.send_signal(signal.SIGCONT)
-            stop(loop.processes)
+            contexts.close()
             ear.destroy_node()
             rclpy.try_shutdown()
 

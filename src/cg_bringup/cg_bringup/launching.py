@@ -97,6 +97,7 @@ def node_actions(
             package=node.package,
             executable=node.executable,
             name=name,
+            exec_name=node.executable,
             parameters=[str(parameters)],
             remappings=list(node.remappings),
             output='screen',
@@ -117,7 +118,7 @@ def node_actions(
     def on_exit(event: ProcessExited, context: LaunchContext) -> list | None:
         name = next(name for name, action in actions.items() if action is event.action)
         if context.is_shutdown and event.returncode in TOLD:
-            if name == MACHINE:
+            if name == MACHINE and judge is not None:
                 launch.logging.get_logger(MACHINE).info(verdict().line)
             return None
         if name != MACHINE or event.returncode != 0:

@@ -40,8 +40,8 @@ class ProcessDied(RuntimeError):
 class Supervisor:
     """Context in which processes run; none is left behind it.
 
-    SIGINT, SIGTERM and SIGHUP end the processes in order; another one meanwhile kills those that
-    are left.
+    SIGINT, SIGTERM and SIGHUP end the processes in order and raise Stopped; another one meanwhile
+    kills those that are left.
 
     Args:
         modules: Name -> Python module and its arguments, in the order of ending.
@@ -74,17 +74,19 @@ class Supervisor:
                     env=os.environ | ON_STDIN,
                     start_new_session=True,
                 )
-        except BaseException:
-            self.__exit__()
+        except BaseException as error:
+            self.__exit__(type(error))
             raise
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
         self.end()
         for process in self.processes.values():
             if process.stdin is not None:
                 process.stdin.close()
         self.stop.restore()
+        if kind is None:
+            self.stop.check()
 
     def wait(
         self, name: str, patience: float = float('inf'), on_wait: Callable[[], None] = lambda: None

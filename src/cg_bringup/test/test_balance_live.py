@@ -17,7 +17,8 @@ from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from cg_bringup.balance_run import BalanceOptions, balance_nodes, start, stop  # noqa: E402
+from cg_bringup.balance_run import BalanceOptions, balance_nodes  # noqa: E402
+from cg_bringup.supervisor import supervised  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import to_nanoseconds  # noqa: E402
 from cg_sysid.experiments import load_experiment  # noqa: E402
@@ -45,7 +46,9 @@ class Loop:
         nodes = balance_nodes(BalanceOptions(**options))
         if setup is not None:
             nodes['simulation_node'].parameters['setup'] = yaml.safe_dump(setup.to_dict())
-        self.processes = start(nodes, directory, self.log)
+        self.context = supervised(nodes, self.log)
+        self.supervisor = self.context.__enter__()
+        self.processes = self.supervisor.processes
 
     def on_applied(self, message):
         self.applied.append((to_nanoseconds(message.header.stamp), message.effort[0]))
@@ -64,7 +67,7 @@ class Loop:
             self.executor.spin_once(timeout_sec=0.01)
 
     def close(self):
-        stop(self.processes)
+        self.context.__exit__(None, None, None)
         self.executor.remove_node(self.node)
         self.node.destroy_node()
         self.log.close()
@@ -100,7 +103,7 @@ def test_lock_step_balances_and_repeats_to_the_bit(loop):
         torques.append(dict(run.applied))
         assert machine.returncode == 0
         assert abs(run.states[-1].position[1]) < 0.1
-        stop(run.processes)
+        run.supervisor.end()
     # An ear may be matched late; what both heard must be the same, and it is nearly all.
     both = sorted(torques[0].keys() & torques[1].keys())
     assert len(both) > 300

@@ -12,7 +12,7 @@ nodes one as it is. A node that was started by hand has no LIFELINE and reads no
 
     python -m cg_dynamics.stop_request MODULE_OR_SCRIPT ARGS...
 
-runs a node that holds its lifeline, and ends without a traceback, from before its imports on, which
+runs a node that holds its lifeline, and ends without a traceback, from before its imports on: they
 take seconds on a busy machine.
 """
 
