@@ -27,6 +27,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -46,6 +47,7 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 IDLE_POLL = 0.05  # s
+FAREWELL = 0.3  # s that listeners are given to receive the last words of a node
 LARGEST_DOUBLE = sys.float_info.max
 LARGEST_INTEGER = 2**63 - 1
 
@@ -206,10 +208,19 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
             spin(node, lambda: stop.requested)
         finally:
             getattr(node, 'close', lambda: None)()
+            _see_off(node)
             node.destroy_node()
         return getattr(node, 'exit_status', 0)
     finally:
         rclpy.try_shutdown()
+
+
+def _see_off(node: Node) -> None:
+    """Wait until the last words of a node are received; a writer that is destroyed repeats none."""
+    deadline = time.monotonic() + FAREWELL
+    for publisher in node.publishers:
+        left = max(0.0, deadline - time.monotonic())
+        publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def spin(node: Node, stopped: Callable[[], bool]) -> None:
