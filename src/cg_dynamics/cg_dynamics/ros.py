@@ -216,7 +216,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
 
 
 def _see_off(node: Node) -> None:
-    """Wait until the last words of a node are received; a writer that is destroyed repeats none."""
+    """Wait until the last words of a node are received: a writer that is gone repeats none."""
     deadline = time.monotonic() + FAREWELL
     for publisher in node.publishers:
         left = max(0.0, deadline - time.monotonic())
