@@ -10,6 +10,7 @@ from cg_dynamics.rig import Setup
 from cg_hardware.simulation import (
     Pace,
     SimulationSettings,
+    check_fall_angle,
     read_setup,
     recording_note,
     ticks_of,
@@ -79,3 +80,12 @@ def test_pushes_hit_at_their_sample():
     assert hits == {50: 2.0, 250: -1.0}
     with pytest.raises(ValueError, match='pushes has 3 numbers'):
         SimulationSettings(pushes=(0.1, 2.0, 0.5))
+
+
+def test_a_fall_angle_needs_a_leg_that_can_lean():
+    settings = SimulationSettings(fall_angle=0.6)
+    check_fall_angle(settings, 'compass_gait', Setup())
+    with pytest.raises(ValueError, match='with fixture legs_tied'):
+        check_fall_angle(settings, 'compass_gait', Setup(fixture='legs_tied'))
+    with pytest.raises(ValueError, match='this is a pendulum'):
+        check_fall_angle(settings, 'pendulum', Setup())
