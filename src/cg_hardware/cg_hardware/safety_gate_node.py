@@ -145,8 +145,9 @@ class SafetyGateNode(Node):
         self._told = self.doubts
 
     def close(self) -> None:
-        """Leave with zero torque, in the place of the last request."""
-        self._send((0.0,) * len(self.joints))
+        """Leave with zero torque, in the place of the last request, if there was one."""
+        if self.message.effort:
+            self._send((0.0,) * len(self.joints))
 
 
 def main(args: list[str] | None = None) -> int:
