@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-import yaml
-
 from cg_bringup.runs import MODES, Run, experiment_nodes
 from cg_bringup.supervisor import ProcessDied, supervised
+from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.stop_request import Stopped
 from cg_sysid.experiments import ExperimentError, experiment_names, load_experiment
 
@@ -91,7 +90,7 @@ def check_counts(run: Run) -> dict[str, int]:
     metadata = run.bag / 'metadata.yaml'
     if not metadata.is_file():
         raise ExperimentError(f'{run.bag} was not closed; `recover` makes a bag of it')
-    tree = yaml.safe_load(metadata.read_text(encoding='utf-8'))['rosbag2_bagfile_information']
+    tree = parse_yaml(read_text(metadata), str(metadata))['rosbag2_bagfile_information']
     counts = {
         topic['topic_metadata']['name']: topic['message_count']
         for topic in tree['topics_with_message_count']

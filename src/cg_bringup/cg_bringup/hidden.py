@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from cg_description.reading import parse_yaml, read_text
+from cg_description.schema import Anything, ListOf, MapOf
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import ModelError
 from cg_dynamics.model import Model
@@ -45,9 +46,14 @@ def hidden_effects_file() -> Path:
     return next((path for path in (beside, *shared) if path.is_file()), beside)
 
 
+def _table() -> dict[str, Any]:
+    path = hidden_effects_file()
+    return MapOf(MapOf(ListOf(Anything()))).of(parse_yaml(read_text(path), str(path)), str(path))
+
+
 def hideable_effects(nominal: Model) -> list[str]:
     """Effects of the file that the library knows, and those that the nominal model has."""
-    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
+    table = _table()
     present = [effect.label for effect in nominal.effects]
     return [name for name in table if name in LIBRARY and name not in present] + present
 
@@ -75,7 +81,7 @@ def hide(nominal: Model, effect: str | None, seed: int) -> Hidden:
         model, factors = perturb(nominal, rng)
         values = {p.name: model.values[f'{name}.{p.name}'] for p in LIBRARY[name].parameters}
         return Hidden(nominal.without_effect(name), model, name, values, factors)
-    table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
+    table = _table()
     values = draw_values(table[name], rng)
     model, factors = perturb(nominal, rng)
     return Hidden(nominal, model.with_effect(name, None, **values), name, values, factors)

@@ -7,13 +7,14 @@ The same nodes as `ros2 run cg_bringup balance`. Tune them while they run:
 0 if the robot stood to the end, 1 if it fell or a node died.
 """
 
-import yaml
 from launch import LaunchDescription
 
 from cg_bringup.balance_run import BalanceOptions, balance_nodes
 from cg_bringup.launching import description, node_actions, number
 from cg_bringup.runs import MODES
 from cg_bringup.verdict import balance_verdict
+from cg_description.reading import parse_yaml
+from cg_description.schema import ListOf, Number
 from cg_dynamics.rig import STANCES
 
 DEFAULT = BalanceOptions()
@@ -32,11 +33,8 @@ ARGUMENTS = {
 
 
 def pushes_of(text: str) -> list[float]:
-    """Instants and impulses of a list in YAML."""
-    try:
-        return [float(number) for number in yaml.safe_load(text) or []]
-    except (yaml.YAMLError, TypeError, ValueError):
-        raise ValueError(f'pushes is {text!r}; [t1, P1, t2, P2, ...] is needed') from None
+    """Instants and impulses of a list in YAML, `[t1, P1, t2, P2, ...]`."""
+    return ListOf(Number()).of(parse_yaml(text, 'pushes') or [], 'pushes')
 
 
 def start(given: dict[str, str]) -> list:

@@ -19,14 +19,15 @@ made by bench/balance_basins.py): a machine without a C compiler needs minutes.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping as Mapped
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from cg_control.linearise import linearise_stance, without_extra_states
+from cg_description.reading import parse_yaml, read_text
+from cg_description.schema import Key, ListOf, Mapping, Number, Text
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import Feedback, simulate_batch
 from cg_dynamics.compiled import compile_model
@@ -42,6 +43,14 @@ SAMPLE_TIME = 0.002  # s
 MARGIN = 0.9
 AT_REST = 0.05  # rad and rad/s of the stance leg at the end
 FALLEN = 0.5  # rad
+NUMBERS = ListOf(Number())
+SHIPPED = ListOf(Mapping({
+    'model': Key(Text(), 'name of the robot'),
+    'model_sha256': Key(Text(), 'hash of the model'),
+    'torque_limit': Key(Number(positive=True), unit='N m'),
+    'gains': Key(Mapping({s: Key(NUMBERS) for s in STANCES}), 'K of the four states'),
+    'bounds': Key(Mapping({s: Key(NUMBERS) for s in STANCES}), 'c(a)', unit='rad'),
+}))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -191,14 +200,14 @@ def shipped_file() -> Path:
 
 @functools.cache
 def _shipped_entries() -> list[dict]:
-    try:
-        return yaml.safe_load(shipped_file().read_text(encoding='utf-8'))
-    except OSError:
+    path = shipped_file()
+    if not path.is_file():
         return []
+    return SHIPPED.of(parse_yaml(read_text(path), str(path)), str(path))
 
 
 def shipped_basins(
-    model: Model, gains: Mapping[str, np.ndarray], torque_limit: float
+    model: Model, gains: Mapped[str, np.ndarray], torque_limit: float
 ) -> dict[str, Basin] | None:
     """The shipped basins, if they are of this model, these gains and this limit."""
     for entry in _shipped_entries():

@@ -15,10 +15,32 @@ from typing import Any
 import numpy as np
 
 from cg_description.model_file import write_atomically
+from cg_description.reading import JSON, parse_json, read_text
+from cg_description.schema import Flag, Key, ListOf, Number, Text
+from cg_description.schema import Mapping as Form
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
 FORMAT = 'cg_trajectory/1'
+ROWS = ListOf(ListOf(Number(), 1), 2)
+SCHEMA = Form({
+    'format': Key(Text((FORMAT,))),
+    'model_hash': Key(Text(longest=100), 'of the model it was planned for'),
+    'provenance': Key(Form({
+        'slope': Key(Number(), default=None, unit='rad'),
+        'friction': Key(Text(), default=None),
+        'periodic': Key(Flag(), default=None),
+    }, further=True), default={}),
+    'phases': Key(ListOf(Form({
+        'stance': Key(Text(STANCES)),
+        'time': Key(ListOf(Number(), 2), unit='s'),
+        'states': Key(ROWS, unit='rad, rad/s'),
+        'rates': Key(ROWS, unit='rad/s, rad/s^2'),
+        'torque': Key(ListOf(Number(), 2), unit='N m'),
+        'gains': Key(ROWS, default=()),
+        'cost_to_go': Key(ListOf(ROWS, 2), default=()),
+    }), 1)),
+})  # fmt: skip
 
 
 class TrajectoryError(ValueError):
@@ -60,6 +82,11 @@ class Phase:
     def __post_init__(self):
         if self.stance not in STANCES:
             raise TrajectoryError(f'stance is {self.stance!r}; allowed are {", ".join(STANCES)}')
+        for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go'):
+            try:
+                object.__setattr__(self, name, np.array(getattr(self, name), float))
+            except (TypeError, ValueError):
+                raise TrajectoryError(f'{name} must be numbers, in rows of one length') from None
         n = np.size(self.time)
         nx = np.shape(self.states)[-1] if np.ndim(self.states) == 2 else 0
         shapes = {
@@ -67,7 +94,7 @@ class Phase:
             'gains': (n, nx), 'cost_to_go': (n, nx, nx),
         }  # fmt: skip
         for name, shape in shapes.items():
-            array = np.array(getattr(self, name), float)
+            array = getattr(self, name)
             if name in ('gains', 'cost_to_go') and array.size == 0:
                 array = np.zeros(shape)
             if array.shape != shape:
@@ -219,38 +246,29 @@ class Trajectory:
         Raises:
             TrajectoryError: for a file that is none, or one of another model.
         """
-        try:
-            text = Path(path).read_text(encoding='utf-8')
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, 'strerror', None) or error
-            raise TrajectoryError(f'{path}: {reason}') from None
-        try:
-            return cls.from_text(text, model)
-        except TrajectoryError as error:
-            raise TrajectoryError(f'{path}: {error}') from None
+        return cls.from_text(read_text(path, TrajectoryError, JSON), model, str(path))
 
     @classmethod
-    def from_text(cls, text: str, model: Model | None = None) -> 'Trajectory':
+    def from_text(
+        cls, text: str, model: Model | None = None, where: str = 'trajectory'
+    ) -> 'Trajectory':
         """Read the text of a file, as it travels on a topic; otherwise as `load`."""
+        content = SCHEMA.of(parse_json(text, where, TrajectoryError), where, TrajectoryError)
         try:
-            content = json.loads(text)
-        except ValueError as error:
-            raise TrajectoryError(f'not JSON: {error}') from None
-        trajectory = cls._from_content(content)
-        if model is not None:
-            trajectory.require_model(model)
+            trajectory = cls._from_content(content)
+            if model is not None:
+                trajectory.require_model(model)
+        except TrajectoryError as error:
+            raise TrajectoryError(f'{where}: {error}') from None
         return trajectory
 
     @classmethod
-    def _from_content(cls, content: Any) -> 'Trajectory':
-        if not isinstance(content, dict) or content.get('format') != FORMAT:
-            raise TrajectoryError(f'not a trajectory: format must be {FORMAT!r}')
+    def _from_content(cls, content: dict[str, Any]) -> 'Trajectory':
         phases = []
-        for number, entry in enumerate(content.get('phases') or ()):
+        for number, entry in enumerate(content['phases']):
             try:
                 phases.append(Phase(**entry))
-            except (TypeError, ValueError) as error:
-                raise TrajectoryError(f'phase {number}: {error}') from None
-        if not isinstance(content.get('model_hash'), str):
-            raise TrajectoryError('model_hash is missing')
-        return cls(tuple(phases), content['model_hash'], content.get('provenance') or {})
+            except TrajectoryError as error:
+                raise TrajectoryError(f'phases[{number}].{error}') from None
+        said = {name: value for name, value in content['provenance'].items() if value is not None}
+        return cls(tuple(phases), content['model_hash'], said)

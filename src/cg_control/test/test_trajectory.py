@@ -97,6 +97,12 @@ def test_bad_phases_are_refused(trajectory, change, message):
         Phase(**values)
 
 
+PHASE = {
+    'stance': 'inner', 'time': [0.0, 1.0], 'torque': [0.0, 0.0],
+    'states': [[0.0] * 4, [0.0] * 4], 'rates': [[0.0] * 4, [0.0] * 4],
+}  # fmt: skip
+
+
 def test_gap_between_phases_is_refused(trajectory):
     late = cubic('outer', np.array([0.4, 0.5, 0.9]), 1.0)
     with pytest.raises(TrajectoryError, match=r'next begins at 0\.4'):
@@ -110,13 +116,25 @@ def test_gap_between_phases_is_refused(trajectory):
     ('text', 'message'),
     [
         ('{', 'not JSON'),
-        ('[]', 'format must be'),
-        (json.dumps({'format': 'cg_trajectory/1', 'phases': [{'speed': 1}]}), 'phase 0: .*speed'),
-        (json.dumps({'format': 'cg_trajectory/1', 'phases': []}), 'model_hash is missing'),
+        ('[]', 'json: an empty list is no mapping; a mapping with format, model_hash, phases'),
+        ('{}', 'json: format: is missing; cg_trajectory/1 is needed'),
+        ({'phases': [{'speed': 1}]}, r"phases\[0\]: unknown entry 'speed'; allowed: stance, time"),
+        ({'model_hash': None}, 'model_hash: is missing'),
+        ({'phases': []}, 'phases: 0 entries; 1 or more are needed'),
+        ({'phases': [{**PHASE, 'torque': [0, True]}]}, r'0\].torque\[1\]: true is no number'),
+        ({'phases': [{**PHASE, 'states': [[0.0], [1.0, 2.0]]}]}, r'phases\[0\].states must be num'),
+        ({'phases': [{**PHASE, 'time': [1.0, 1.0]}]}, r'phases\[0\].time must hold at least two'),
+        ({'phases': [{**PHASE, 'time': [0.0, float('inf')]}]}, r'time\[1\]: inf is not allowed'),
+        ({'phases': [{**PHASE, 'rates': [[1.0], [1.0]]}]}, r'phases\[0\].rates has shape'),
+        ({'provenance': {'slope': 'up'}}, "provenance.slope: 'up' is no number"),
+        ({'provenance': {'at': [float('nan')]}}, r'provenance.at\[0\]: nan is not allowed'),
     ],
 )
 def test_bad_files_are_refused(tmp_path, text, message):
     path = tmp_path / 'bad.json'
+    if isinstance(text, dict):
+        whole = {'format': 'cg_trajectory/1', 'model_hash': 'abc', 'phases': [PHASE]}
+        text = json.dumps({k: v for k, v in {**whole, **text}.items() if v is not None})
     path.write_text(text)
     with pytest.raises(TrajectoryError, match=message):
         Trajectory.load(path)

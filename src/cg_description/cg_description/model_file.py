@@ -1,12 +1,11 @@
 """Model files: one YAML file holds every number of a robot, with unit and source.
 
-This module knows the form of the file (what is required, that numbers are numbers, that a file
-is written whole or not at all). What the numbers mean, and which are allowed, is known where the
+This module knows the form of the file (`SCHEMA`, the reference of which is docs/model_file.md) and
+writes files whole or not at all. What the numbers mean, and which are allowed, is known where the
 physics is, in cg_dynamics.
 """
 
 import hashlib
-import math
 import os
 import tempfile
 from dataclasses import dataclass, field
@@ -15,11 +14,60 @@ from typing import Any
 
 import yaml
 
+from cg_description.reading import DocumentError, parse_yaml, read_text
+from cg_description.schema import NAME, Flag, Key, ListOf, Mapping, MapOf, Number, Text
+
 FORMAT = 'cg_model/1'
 
 
-class ModelFileError(ValueError):
+class ModelFileError(DocumentError):
     """A model file that cannot be used; the message says what, where and what is allowed."""
+
+
+QUANTITY = Mapping({
+    'value': Key(Number(infinite=True), 'the number, in `unit`; `.inf` where it means rigid'),
+    'unit': Key(NAME, "SI unit, spelt as in the tables below; '1' for a ratio"),
+    'tolerance': Key(
+        Number(0.0), 'one standard deviation of what is believed about the value; without one '
+        'identification takes a wide guess', default=None, unit='as `unit`',
+    ),
+    'fixed': Key(Flag(), 'true: identification leaves the number alone', default=False),
+    'source': Key(Text(), 'where the number comes from', default=''),
+})  # fmt: skip
+EFFECT = Mapping({
+    'name': Key(NAME, 'standard name of the effect ([effects.md](effects.md))'),
+    'at': Key(
+        NAME, 'joint, body or sensor that it acts on; the usual one of that effect if absent',
+        default=None,
+    ),
+    'parameters': Key(
+        MapOf(QUANTITY), 'its numbers; one that is absent takes the first value at which '
+        'identification starts', default={},
+    ),
+})  # fmt: skip
+SENSOR = Mapping({
+    'noise': Key(QUANTITY, 'standard deviation of one sample', default=None,
+                 unit='of the channel'),
+    'resolution': Key(QUANTITY, 'smallest step, as one count of an encoder', default=None,
+                      unit='of the channel'),
+})  # fmt: skip
+ACTUATOR = Mapping({
+    'limit': Key(QUANTITY, 'largest torque either way; the drive clips to it, controllers and '
+                 'planner stay below it', default=None, unit='N m'),
+})  # fmt: skip
+SCHEMA = Mapping({
+    'format': Key(Text((FORMAT,)), 'form of the file'),
+    'name': Key(NAME, 'name of the robot'),
+    'mechanism': Key(NAME, 'rigid bodies and joints, one of those below'),
+    'description': Key(Text(), 'free text', default=''),
+    'parameters': Key(MapOf(QUANTITY), 'every number of the mechanism'),
+    'effects': Key(ListOf(EFFECT), 'what the robot has beyond rigid bodies, in the order in '
+                   'which it acts', default=()),
+    'sensors': Key(MapOf(SENSOR), 'output channel -> how well it measures', default={}),
+    'actuators': Key(MapOf(ACTUATOR), 'input channel -> what its drive can do', default={}),
+    'provenance': Key(Mapping({}, further=True), 'where the file comes from; any keys',
+                      default={}),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,7 +90,7 @@ class Quantity:
     source: str = ''
 
     def to_yaml(self) -> dict[str, Any]:
-        """The mapping that `quantity` reads back."""
+        """The mapping that `parse` reads back."""
         entry: dict[str, Any] = {'value': float(self.value), 'unit': self.unit}
         if self.tolerance is not None:
             entry['tolerance'] = float(self.tolerance)
@@ -87,70 +135,25 @@ class ModelFile:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
-def quantity(entry: Any, where: str) -> Quantity:
-    """Read one quantity, `{value: 1.0, unit: m, ...}`.
-
-    Raises:
-        ModelFileError: if it has another form.
-    """
-    if not isinstance(entry, dict) or 'value' not in entry or 'unit' not in entry:
-        raise ModelFileError(f'{where}: expected {{value: <number>, unit: <text>}}, got {entry!r}')
-    unknown = set(entry) - {'value', 'unit', 'tolerance', 'fixed', 'source'}
-    if unknown:
-        raise ModelFileError(
-            f'{where}: unknown entry {sorted(unknown)[0]!r}; '
-            'allowed are value, unit, tolerance, fixed, source'
-        )
-    return Quantity(
-        value=_number(entry['value'], f'{where}.value', finite=False),
-        unit=str(entry['unit']),
-        tolerance=None
-        if entry.get('tolerance') is None
-        else _number(entry['tolerance'], f'{where}.tolerance'),
-        fixed=bool(entry.get('fixed', False)),
-        source=str(entry.get('source', '')),
-    )
-
-
 def parse(text: str, where: str = 'model') -> ModelFile:
     """Read the text of a model file.
 
     Raises:
         ModelFileError: naming the entry that is wrong and what is allowed there.
     """
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ModelFileError(f'{where}: not YAML: {" ".join(str(error).split())}') from None
-    if not isinstance(tree, dict):
-        raise ModelFileError(f'{where}: expected a mapping with format: {FORMAT}')
-    if tree.get('format') != FORMAT:
-        raise ModelFileError(f'{where}: format is {tree.get("format")!r}, expected {FORMAT!r}')
-    for key in ('name', 'mechanism', 'parameters'):
-        if key not in tree:
-            raise ModelFileError(f'{where}: {key!r} is missing')
-    allowed = {'format', *ModelFile.__dataclass_fields__}
-    for key in tree:
-        if key not in allowed:
-            raise ModelFileError(f'{where}: unknown entry {key!r}; allowed: {sorted(allowed)}')
+    tree = SCHEMA.of(parse_yaml(text, where, ModelFileError), where, ModelFileError)
     return ModelFile(
-        name=str(tree['name']),
-        mechanism=str(tree['mechanism']),
-        parameters=_quantities(tree['parameters'], f'{where}: parameters'),
+        name=tree['name'],
+        mechanism=tree['mechanism'],
+        parameters=_quantities(tree['parameters']),
         effects=tuple(
-            _effect(entry, f'{where}: effects[{index}]')
-            for index, entry in enumerate(tree.get('effects') or ())
+            EffectEntry(entry['name'], entry['at'], _quantities(entry['parameters']))
+            for entry in tree['effects']
         ),
-        sensors={
-            name: _quantities(entry, f'{where}: sensors.{name}')
-            for name, entry in (tree.get('sensors') or {}).items()
-        },
-        actuators={
-            name: _quantities(entry, f'{where}: actuators.{name}')
-            for name, entry in (tree.get('actuators') or {}).items()
-        },
-        description=str(tree.get('description', '')),
-        provenance=dict(tree.get('provenance') or {}),
+        sensors={channel: _quantities(entry) for channel, entry in tree['sensors'].items()},
+        actuators={channel: _quantities(entry) for channel, entry in tree['actuators'].items()},
+        description=tree['description'],
+        provenance=dict(tree['provenance']),
     )
 
 
@@ -160,12 +163,7 @@ def load(path: str | Path) -> ModelFile:
     Raises:
         ModelFileError: if it is missing, unreadable or wrong.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise ModelFileError(f'cannot read model file {path}: {error}') from None
-    return parse(text, str(path))
+    return parse(read_text(path, ModelFileError), str(path))
 
 
 def dump(model: ModelFile) -> str:
@@ -227,30 +225,5 @@ def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _number(value: Any, where: str, finite: bool = True) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ModelFileError(f'{where}: expected a number, got {value!r}')
-    if math.isnan(value) or (finite and math.isinf(value)):
-        raise ModelFileError(f'{where}: expected a finite number, got {value!r}')
-    return float(value)
-
-
-def _quantities(entries: Any, where: str) -> dict[str, Quantity]:
-    if not isinstance(entries, dict):
-        raise ModelFileError(f'{where}: expected a mapping of quantities, got {entries!r}')
-    return {str(name): quantity(entry, f'{where}.{name}') for name, entry in entries.items()}
-
-
-def _effect(entry: Any, where: str) -> EffectEntry:
-    if not isinstance(entry, dict) or 'name' not in entry:
-        raise ModelFileError(f'{where}: expected {{name: <effect>, parameters: ...}}')
-    unknown = set(entry) - {'name', 'at', 'parameters'}
-    if unknown:
-        raise ModelFileError(
-            f'{where}: unknown entry {sorted(unknown)[0]!r}; allowed are name, at, parameters'
-        )
-    return EffectEntry(
-        name=str(entry['name']),
-        at=None if entry.get('at') is None else str(entry['at']),
-        parameters=_quantities(entry.get('parameters') or {}, f'{where}.parameters'),
-    )
+def _quantities(entries: dict[str, Any]) -> dict[str, Quantity]:
+    return {name: Quantity(**entry) for name, entry in entries.items() if entry is not None}

@@ -11,7 +11,6 @@ from cg_description.model_file import (
     dump,
     load,
     parse,
-    quantity,
     save,
     sha256,
     write_atomically,
@@ -44,20 +43,33 @@ def test_models_that_come_along_read_back(path):
     ('text', 'message'),
     [
         ('[1, 2', 'here: not YAML'),
-        ('just words', 'expected a mapping'),
-        ('format: other/1', "format is 'other/1', expected 'cg_model/1'"),
-        ('format: cg_model/1', "'name' is missing"),
-        (MINIMAL.replace('mechanism: pendulum\n', ''), "'mechanism' is missing"),
+        ('just words', "here: 'just words' is no mapping; a mapping with format, name"),
+        ('', 'here: nothing is no mapping'),
+        ('format: other/1', "here: format: 'other/1' is not cg_model/1"),
+        ('a: 1', 'here: format: is missing; cg_model/1 is needed'),
+        ('format: cg_model/1', 'name: is missing'),
+        (MINIMAL.replace('mechanism: pendulum\n', ''), 'mechanism: is missing'),
         (MINIMAL + 'colour: red\n', "unknown entry 'colour'; allowed"),
-        (MINIMAL.replace('unit: kg m^2, ', ''), r'parameters.inertia: expected \{value'),
-        (MINIMAL.replace('0.3', 'heavy'), "inertia.value: expected a number, got 'heavy'"),
-        (MINIMAL.replace('0.3', 'true'), 'inertia.value: expected a number, got True'),
-        (MINIMAL.replace('0.3', '.nan'), 'expected a finite number, got nan'),
-        (MINIMAL.replace('tolerance', 'sigma'), "unknown entry 'sigma'; allowed are value"),
-        (MINIMAL.replace('0.1', '.inf'), 'tolerance: expected a finite number'),
-        (MINIMAL + 'effects: [payload]', r'effects\[0\]: expected \{name'),
+        (MINIMAL + 'efects: []\n', "unknown entry 'efects'; .*did you mean 'effects'"),
+        (MINIMAL.replace('unit: kg m^2, ', ''), r'parameters.inertia.unit: is missing'),
+        (MINIMAL.replace('0.3', 'heavy'), "inertia.value: 'heavy' is no number"),
+        (MINIMAL.replace('0.3', "'0.3'"), "inertia.value: '0.3' is no number; numbers have no qu"),
+        (MINIMAL.replace('0.3', 'true'), 'inertia.value: true is no number'),
+        (MINIMAL.replace('0.3', '.nan'), 'nan is not allowed; a number is needed'),
+        (MINIMAL.replace('0.3', '9' * 400), "inertia.value: '9999.*…' is no number"),
+        (MINIMAL.replace('tolerance', 'sigma'), "unknown entry 'sigma'; allowed: value, unit"),
+        (MINIMAL.replace('0.1', '.inf'), 'tolerance: inf is not allowed'),
+        (MINIMAL.replace('0.1', '-0.1'), 'tolerance: -0.1 is not allowed; a number of 0 or more'),
+        (MINIMAL.replace('true', 'maybe'), "inertia.fixed: 'maybe' is neither true nor false"),
+        (MINIMAL.replace('thing', '[a, b]'), 'name: a list of 2 is no text'),
+        (MINIMAL.replace('thing', '1.10'), 'name: 1.1 is no text; write it in quotes'),
+        (MINIMAL + 'effects: [payload]', r"effects\[0\]: 'payload' is no mapping; a mapping with n"),
         (MINIMAL + 'effects: [{name: a, where: b}]', "effects.0.: unknown entry 'where'"),
-        (MINIMAL + 'sensors: {angle: 3}', 'sensors.angle: expected a mapping of quantities'),
+        (MINIMAL + 'sensors: {angle: 3}', 'sensors.angle: 3 is no mapping'),
+        (
+            MINIMAL + 'effects: [{name: a}, {name: b, parameters: {mass: {value: abc, unit: kg}}}]',
+            r"here: effects\[1\].parameters.mass.value: 'abc' is no number; a number is needed$",
+        ),
     ],
 )
 def test_wrong_form_is_named(text, message):
@@ -66,11 +78,17 @@ def test_wrong_form_is_named(text, message):
 
 
 def test_infinite_values_are_allowed_where_they_mean_rigid():
-    assert quantity({'value': float('inf'), 'unit': 'N m/rad'}, 'k').value == float('inf')
+    assert parse(MINIMAL.replace('0.3', '.inf')).parameters['inertia'].value == float('inf')
+
+
+def test_exponents_need_neither_point_nor_sign():
+    """YAML 1.1 takes 3e-1 for text."""
+    for text in ('3e-1', '30E-2', '0.03e1', '+3.0e-1'):
+        assert parse(MINIMAL.replace('0.3', text)).parameters['inertia'].value == 0.3
 
 
 def test_missing_file_is_named(tmp_path):
-    with pytest.raises(ModelFileError, match=r'cannot read model file .*none\.yaml'):
+    with pytest.raises(ModelFileError, match=r'none\.yaml: cannot be read: No such file'):
         load(tmp_path / 'none.yaml')
 
 

@@ -1,5 +1,6 @@
 """A model: mechanism, effects and their numbers. The one thing that all other packages load."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,9 @@ from cg_description.model_file import (
     sha256,
     write_atomically,
 )
-from cg_dynamics.effects import Effect, make_effect
+from cg_description.reading import shown
+from cg_description.schema import meant
+from cg_dynamics.effects import LIBRARY, Effect, make_effect
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import Mechanism, mechanism
 from cg_dynamics.parameter import Parameter
@@ -67,21 +70,27 @@ class Model:
         """Give meaning to a model file: known names, right units, values in range."""
         try:
             body = mechanism(file.mechanism)
-            quantities = _match(body.parameters, file.parameters, 'parameters')
+            quantities = _match(body.parameters, file.parameters, 'parameters', needed=True)
             effects: list[Effect] = []
-            for entry in file.effects:
-                effect = make_effect(entry.name, body, entry.at)
+            for index, entry in enumerate(file.effects):
+                place = f'effects[{index}]'
+                effect = _effect(entry, body, place)
                 if any(effect.label == other.label for other in effects):
-                    raise ModelError(f'effect {effect.label!r} is listed twice')
+                    raise ModelError(f'{place}: effect {effect.label!r} is listed twice')
                 effects.append(effect)
-                found = _match(effect.parameters, entry.parameters, effect.label)
+                found = _match(effect.parameters, entry.parameters, f'{place}.parameters')
                 quantities |= {f'{effect.label}.{name}': q for name, q in found.items()}
             _known('sensors', file.sensors, body.outputs)
             _known('actuators', file.actuators, body.inputs)
             for channel, unit in zip(body.outputs, body.output_units, strict=True):
                 for name, q in file.sensors.get(channel, {}).items():
-                    _known(f'sensors.{channel}', [name], ('noise', 'resolution'))
                     _same_unit(f'sensors.{channel}.{name}', q.unit, unit)
+                    _require(math.isfinite(q.value) and q.value >= 0,
+                             f'sensors.{channel}.{name}.value', q, 'a finite number of 0 or more')
+            for channel, entries in file.actuators.items():
+                for name, q in entries.items():
+                    _require(q.value > 0, f'actuators.{channel}.{name}.value', q,
+                             'a positive number')
         except ModelError as error:
             raise ModelError(f'{where}: {error}') from None
         model = cls(
@@ -214,34 +223,49 @@ class Model:
                 )
 
 
+def _effect(entry: EffectEntry, body: Mechanism, place: str) -> Effect:
+    try:
+        return make_effect(entry.name, body, entry.at)
+    except ModelError as error:
+        hint = '' if entry.name in LIBRARY else meant(entry.name, LIBRARY)
+        raise ModelError(f'{place}: {error}{hint}') from None
+
+
 def _match(
-    declared: tuple[Parameter, ...], given: Mapping[str, Quantity], owner: str
+    declared: tuple[Parameter, ...], given: Mapping[str, Quantity], place: str,
+    needed: bool = False,
 ) -> dict[str, Quantity]:
-    _known(owner, given, [p.name for p in declared])
+    """Quantities as declared; a mechanism needs all of them, an effect has typical ones."""
+    _known(place, given, [p.name for p in declared])
     found = {}
     for p in declared:
         if p.name not in given:
-            # A mechanism has no typical numbers; an effect has.
-            if owner == 'parameters':
-                raise ModelError(f'{owner}.{p.name} ({p.unit}, {p.description}) is missing')
+            if needed:
+                raise ModelError(f'{place}.{p.name} ({p.unit}, {p.description}) is missing')
             found[p.name] = Quantity(p.default, p.unit, fixed=not p.free)
             continue
         q = given[p.name]
-        _same_unit(f'{owner}.{p.name}', q.unit, p.unit)
-        p.check(q.value, owner)
+        _same_unit(f'{place}.{p.name}', q.unit, p.unit)
+        p.check(q.value, place)
         found[p.name] = q
     return found
 
 
-def _same_unit(where: str, unit: str, expected: str) -> None:
+def _require(right: bool, place: str, q: Quantity, allowed: str) -> None:
+    if not right:
+        raise ModelError(f'{place}: {q.value:g} is not allowed; {allowed} is needed')
+
+
+def _same_unit(place: str, unit: str, expected: str) -> None:
     if unit != expected:
-        raise ModelError(f'{where}: unit is {unit!r}, expected {expected!r}')
+        raise ModelError(f'{place}.unit: {shown(unit)} is not {expected!r}')
 
 
-def _known(where: str, names, allowed) -> None:
+def _known(place: str, names, allowed) -> None:
     for name in names:
         if name not in allowed:
-            raise ModelError(f'{where}: unknown entry {name!r}; allowed: {", ".join(allowed)}')
+            raise ModelError(f'{place}: unknown entry {shown(name)}; allowed: '
+                             f'{", ".join(allowed)}{meant(name, allowed)}')
 
 
 __all__ = ['Model', 'ModelError', 'ModelFileError']

@@ -1,13 +1,26 @@
 """The set-up of an experiment: what was done to the rig, apart from the robot itself."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
+from cg_description.schema import Flag, Key, ListOf, Mapping, Number, Text
 from cg_dynamics.errors import SetupError
 
 STANCES = ('inner', 'outer')
 FIXTURES = ('none', 'inner_fixed', 'outer_fixed', 'legs_tied')
+SPRING = Mapping({
+    'body': Key(Text(STANCES), 'the leg pair it is tied to'),
+    'point': Key(Number(), 'where on the leg, from its foot', unit='m'),
+    'anchor': Key(ListOf(Number(), 2, 2), '[x, z] of the other end', unit='m'),
+    'stiffness': Key(Number(0.0), unit='N/m'),
+    'free_length': Key(Number(0.0), unit='m'),
+})  # fmt: skip
+SCHEMA = Mapping({
+    'stance': Key(Text(STANCES), default='inner'),
+    'fixture': Key(Text(FIXTURES), default='none'),
+    'springs': Key(ListOf(SPRING), default=()),
+    'on_blocks': Key(Flag(), default=True),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,15 +74,11 @@ class Setup:
         Raises:
             SetupError: naming the entry that is wrong and what is allowed.
         """
-        if not isinstance(entries, dict):
-            raise SetupError(f'setup: expected a mapping, got {entries!r}')
-        _known('setup', entries, cls.__dataclass_fields__)
-        values = dict(entries)
-        if 'fixture' in values and 'stance' not in values and values['fixture'] != 'legs_tied':
-            values['stance'] = 'outer' if values['fixture'] == 'outer_fixed' else 'inner'
+        values = SCHEMA.of(entries, '', SetupError, path='setup')
+        if 'stance' not in entries and values['fixture'] == 'outer_fixed':
+            values['stance'] = 'outer'
         values['springs'] = tuple(
-            _spring(entry, f'setup.springs[{index}]')
-            for index, entry in enumerate(entries.get('springs') or ())
+            Spring(**{**spring, 'anchor': tuple(spring['anchor'])}) for spring in values['springs']
         )
         return cls(**values)
 
@@ -92,39 +101,6 @@ class Setup:
         }
 
 
-def _spring(entry: Any, where: str) -> Spring:
-    if not isinstance(entry, dict):
-        raise SetupError(f'{where}: expected a mapping, got {entry!r}')
-    _known(where, entry, Spring.__dataclass_fields__)
-    missing = sorted(set(Spring.__dataclass_fields__) - set(entry))
-    if missing:
-        raise SetupError(f'{where}: {missing[0]!r} is missing')
-    _one_of(f'{where}.body', entry['body'], STANCES)
-    anchor = entry['anchor']
-    if not isinstance(anchor, list | tuple) or len(anchor) != 2:
-        raise SetupError(f'{where}.anchor: expected [x, z] in m, got {anchor!r}')
-    numbers = {
-        name: _number(entry[name], f'{where}.{name}')
-        for name in ('point', 'stiffness', 'free_length')
-    }
-    if numbers['stiffness'] < 0 or numbers['free_length'] < 0:
-        raise SetupError(f'{where}: stiffness and free_length must not be negative')
-    x, z = (_number(value, f'{where}.anchor') for value in anchor)
-    return Spring(body=entry['body'], anchor=(x, z), **numbers)
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise SetupError(f'{where}: expected a finite number, got {value!r}')
-    return float(value)
-
-
 def _one_of(where: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise SetupError(f'{where}: {value!r} is not one of {", ".join(allowed)}')
-
-
-def _known(where: str, entries: dict, allowed) -> None:
-    for key in entries:
-        if key not in allowed:
-            raise SetupError(f'{where}: unknown entry {key!r}; allowed: {", ".join(allowed)}')

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from cg_description.paths import model_path
+from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
@@ -139,15 +140,9 @@ def read_setup(text: str) -> Setup:
     """
     source = text
     if text and '\n' not in text and ':' not in text:
-        try:
-            source = Path(text).expanduser().read_text(encoding='utf-8')
-        except OSError as error:
-            raise ValueError(f'setup: cannot read file {text!r}: {error.strerror}') from None
-    try:
-        entries = yaml.safe_load(source) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f'setup is not YAML: {" ".join(str(error).split())}') from None
-    return Setup.from_dict(entries)
+        source = read_text(Path(text).expanduser())
+    entries = parse_yaml(source, 'setup')
+    return Setup.from_dict({} if entries is None else entries)
 
 
 def build_plant(settings: SimulationSettings, model: Model, setup: Setup) -> Plant:
