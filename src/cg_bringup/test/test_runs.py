@@ -78,7 +78,7 @@ def test_unknown_experiment_lists_those_there_are():
         ({'setup': {'stance': 'left'}}, 'stance'),
         ({'excitation': {'kind': 'square'}}, 'kind'),
         ({'excitation': {'kind': 'chirp', 'color': 1}}, 'color'),
-        ({'surprise': 1}, 'expected the entries'),
+        ({'surprise': 1}, "unknown entry 'surprise'; allowed: setup, initial_state"),
     ],
 )
 def test_a_wrong_file_is_refused_with_its_reason(tmp_path, change, message):

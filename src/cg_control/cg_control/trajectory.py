@@ -27,10 +27,10 @@ SCHEMA = Form({
     'format': Key(Text((FORMAT,))),
     'model_hash': Key(Text(longest=100), 'of the model it was planned for'),
     'provenance': Key(Form({
-        'slope': Key(Number(), default=None, unit='rad'),
-        'friction': Key(Text(), default=None),
-        'periodic': Key(Flag(), default=None),
-    }, further=True), default={}),
+        'slope': Key(Number(), default=0.0, unit='rad'),
+        'friction': Key(Text(), default=''),
+        'periodic': Key(Flag(), default=False),
+    }, further=True, fill=False), default={}),
     'phases': Key(ListOf(Form({
         'stance': Key(Text(STANCES)),
         'time': Key(ListOf(Number(), 2), unit='s'),
@@ -270,5 +270,4 @@ class Trajectory:
                 phases.append(Phase(**entry))
             except TrajectoryError as error:
                 raise TrajectoryError(f'phases[{number}].{error}') from None
-        said = {name: value for name, value in content['provenance'].items() if value is not None}
-        return cls(tuple(phases), content['model_hash'], said)
+        return cls(tuple(phases), content['model_hash'], content['provenance'])

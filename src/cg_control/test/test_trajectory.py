@@ -122,7 +122,7 @@ def test_gap_between_phases_is_refused(trajectory):
         ({'model_hash': None}, 'model_hash: is missing'),
         ({'phases': []}, 'phases: 0 entries; 1 or more are needed'),
         ({'phases': [{**PHASE, 'torque': [0, True]}]}, r'0\].torque\[1\]: true is no number'),
-        ({'phases': [{**PHASE, 'states': [[0.0], [1.0, 2.0]]}]}, r'phases\[0\].states must be num'),
+        ({'phases': [{**PHASE, 'states': [[0.0], [1.0, 2.0]]}]}, r'phases\[0\].states must be'),
         ({'phases': [{**PHASE, 'time': [1.0, 1.0]}]}, r'phases\[0\].time must hold at least two'),
         ({'phases': [{**PHASE, 'time': [0.0, float('inf')]}]}, r'time\[1\]: inf is not allowed'),
         ({'phases': [{**PHASE, 'rates': [[1.0], [1.0]]}]}, r'phases\[0\].rates has shape'),

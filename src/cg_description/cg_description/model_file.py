@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from cg_description.reading import DocumentError, parse_yaml, read_text
-from cg_description.schema import NAME, Flag, Key, ListOf, Mapping, MapOf, Number, Text
+from cg_description.schema import NAME, Flag, Key, ListOf, MapOf, Mapping, Number, Text
 
 FORMAT = 'cg_model/1'
 

@@ -187,16 +187,17 @@ class _Builder:
         self.anchors: dict[str, tuple[Any, int]] = {}
         self.root: Any = None
         self.documents = 0
+        self.line = 0
 
     def build(self, events: Iterable[yaml.Event]) -> Any:
         for event in events:
-            self.line = event.start_mark.line + 1
+            self.line = event.start_mark.line + 1 if event.start_mark else 0
             if isinstance(event, yaml.DocumentStartEvent):
                 self.documents += 1
                 if self.documents > 1:
                     self._refuse('a second document begins here; one is allowed')
             elif isinstance(event, yaml.AliasEvent):
-                if event.anchor not in self.anchors:
+                if event.anchor is None or event.anchor not in self.anchors:
                     self._refuse(f'the alias {shown(event.anchor)} has no anchor before it')
                 value, nodes = self.anchors[event.anchor]
                 self._count(nodes)
@@ -309,8 +310,8 @@ def _yaml_problem(problem: yaml.YAMLError) -> str:
     words = ' '.join(str(getattr(problem, 'problem', None) or '').split())
     if mark is not None:
         return f'line {mark.line + 1}, column {mark.column + 1}: {words}'
-    character = getattr(problem, 'character', None)
-    if character is not None:
+    if isinstance(problem, yaml.reader.ReaderError):
+        character = problem.character
         code = character if isinstance(character, int) else ord(character[:1])
         return f'the character {code:#04x} at place {problem.position} is not allowed'
     return ' '.join(str(problem).split())

@@ -8,13 +8,14 @@ A message is one line: file, path inside it, what stands there, what is allowed,
 reference of the format (docs/model_file.md).
 """
 
+import contextlib
 import difflib
 import math
 import re
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from cg_description.reading import SHOWN, DocumentError, shown
@@ -36,11 +37,11 @@ class Place:
         """The entry of that name."""
         name = name if len(name) <= SHOWN else f'{name[:SHOWN]}…'
         name = name if name.isprintable() else repr(name)
-        return replace(self, path=f'{self.path}.{name}' if self.path else name)
+        return Place(self.where, f'{self.path}.{name}' if self.path else name, self.error)
 
     def item(self, index: int) -> 'Place':
         """The entry of that number, from 0."""
-        return replace(self, path=f'{self.path}[{index}]')
+        return Place(self.where, f'{self.path}[{index}]', self.error)
 
     def wrong(self, message: str) -> Exception:
         """The error to raise."""
@@ -76,12 +77,14 @@ class Number(Kind):
         upper: Largest value allowed.
         positive: Whether 0 is forbidden too.
         infinite: Whether `.inf` is allowed.
+        nan: Whether `.nan`, no measurement, is allowed.
     """
 
     lower: float = -math.inf
     upper: float = math.inf
     positive: bool = False
     infinite: bool = False
+    nan: bool = False
 
     @property
     def words(self) -> str:  # type: ignore[override]
@@ -112,7 +115,9 @@ class Number(Kind):
 
     def holds(self, value: float) -> bool:
         """Whether a number lies in the range."""
-        if math.isnan(value) or (math.isinf(value) and not self.infinite):
+        if math.isnan(value):
+            return self.nan
+        if math.isinf(value) and not self.infinite:
             return False
         return self.lower <= value <= self.upper and not (self.positive and value <= 0)
 
@@ -191,8 +196,9 @@ class Flag(Kind):
 
 @dataclass(frozen=True)
 class Anything(Kind):
-    """Plain data of any form, less numbers that are not finite."""
+    """Plain data of any form; numbers must be finite unless told otherwise."""
 
+    finite: bool = True
     words = 'anything'
 
     def read(self, value: Any, place: Place) -> Any:
@@ -201,7 +207,7 @@ class Anything(Kind):
             return {name: self.read(entry, place.key(name)) for name, entry in value.items()}
         if isinstance(value, list):
             return [self.read(entry, place.item(i)) for i, entry in enumerate(value)]
-        if isinstance(value, float) and not math.isfinite(value):
+        if self.finite and isinstance(value, float) and not math.isfinite(value):
             raise place.wrong(f'{shown(value)} is not allowed; a finite number is needed')
         return value
 
@@ -228,10 +234,11 @@ class ListOf(Kind):
             exact = self.least == self.most
             needed = f'{self.least}' if exact else f'{self.least} or more'
             raise place.wrong(f'{len(value)} entries; {needed} are needed')
-        if isinstance(self.kind, Number) and set(map(type, value)) == {float}:
+        if isinstance(self.kind, Number) and set(map(type, value)) <= {float, int}:
             # Trajectories hold many: the path of each is made only if one is wrong.
-            if all(map(self.kind.holds, value)):
-                return list(value)
+            with contextlib.suppress(OverflowError):
+                if all(map(self.kind.holds, value)):
+                    return list(map(float, value))
         return [self.kind.read(entry, place.item(i)) for i, entry in enumerate(value)]
 
 
@@ -277,10 +284,12 @@ class Mapping(Kind):
     Attributes:
         keys: Key -> what it holds.
         further: Whether other keys may stand there too; they are kept as they are.
+        fill: Whether keys that are absent get their defaults; otherwise they remain absent.
     """
 
     keys: Mapped[str, Key]
     further: bool = False
+    fill: bool = True
 
     @property
     def words(self) -> str:  # type: ignore[override]
@@ -302,7 +311,11 @@ class Mapping(Kind):
                 f'{meant(name, self.keys)}'
             )
         order = dict.fromkeys((*(name for name in value if name in self.keys), *self.keys))
-        found = {name: self._entry(name, value, place) for name in order}
+        found = {
+            name: self._entry(name, value, place)
+            for name in order
+            if self.fill or name in value or self.keys[name].default is NEEDED
+        }
         return found | {name: Anything().read(entry, place.key(name))
                         for name, entry in others.items()}
 

@@ -50,7 +50,7 @@ def test_setup_is_read_from_text_and_from_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     ('text', 'message'),
-    [('/no/such/file', 'cannot read'), ('stance: [', 'not YAML'), ('stance: both', 'stance')],
+    [('/no/such/file', 'cannot be read'), ('stance: [', 'not YAML'), ('stance: both', 'stance')],
 )
 def test_a_wrong_setup_is_refused_with_its_reason(text, message):
     with pytest.raises(ValueError, match=message):

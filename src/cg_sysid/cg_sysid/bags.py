@@ -6,26 +6,29 @@ axis. `read_bag` does both; `write_bag` goes the other way.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from cg_description.reading import parse_yaml, read_text
+from cg_description.schema import Mapping as Form
 from cg_sysid import channels
 from cg_sysid.alignment import to_record
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.channels import NOTE_TOPIC, STRING, Topic
 from cg_sysid.errors import RecordingError
-from cg_sysid.raw import NOTE_FORMAT, RawRecording, RawTopic
+from cg_sysid.raw import NOTE, RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S, SHARED_ROW_NS, Record
 from cg_sysid.recover import needs_recovery
 
-__all__ = ['RawRecording', 'RawTopic', 'parse_note', 'read_bag', 'read_raw', 'to_record',
-           'write_bag']
+__all__ = ['RawRecording', 'RawTopic', 'load_note', 'no_bag', 'parse_note', 'read_bag', 'read_raw',
+           'to_record', 'write_bag']
 
+LOGS = ('.csv', '.mat', '.json')  # what an import is needed for
 MCAP_MAGIC = b'\x89MCAP0\r\n'
 
 
@@ -67,7 +70,7 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         raise _unfinished(path)
     if path.is_file() and path.suffix not in ('.mcap', '.db3'):
-        raise _no_bag(path)
+        raise no_bag(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             return _read_open(path, reader, note)
@@ -80,7 +83,17 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
         raise RecordingError(msg) from error
 
 
-def _no_bag(path: Path) -> RecordingError:
+def no_bag(path: Path) -> RecordingError:
+    """The error of what is no bag; of a log, with the way to make bags of it."""
+    logs = [path] if path.is_file() else sorted(path.glob('*.*'))
+    if any(log.suffix.lower() in LOGS for log in logs):
+        kind = 'a log' if path.is_file() else 'a folder of logs'
+        folder = path.parent if path.is_file() else path
+        return RecordingError(
+            f'{path}: {kind}, no bag; a mapping file says which column is which channel, then '
+            f'`python3 -m cg_sysid.importing MAPPING.yaml {folder} --out bags` makes bags of it '
+            '(docs/data.md, "Import of foreign logs")'
+        )
     return RecordingError(
         f'{path}: not a bag; a directory with metadata.yaml and .mcap or .db3 files is needed'
     )
@@ -93,7 +106,7 @@ def _unfinished(path: Path) -> RecordingError:
     elif path.is_dir() and any(path.glob('*.db3*')):
         way_out = f'ros2 bag reindex {path}'
     else:
-        return _no_bag(path)
+        return no_bag(path)
     return RecordingError(
         f'{path}: the recording was cut off (its index or metadata.yaml is missing); '
         f'rebuild it with: {way_out}'
@@ -189,30 +202,35 @@ def _read_note(path: Path, reader: AnyReader) -> dict[str, Any]:
 
 
 def parse_note(text: str, where: str) -> dict[str, Any]:
-    """A recording note from its YAML text.
+    """A recording note from its YAML text, as a bag carries it: other keys than ours are kept.
 
     Args:
         text: YAML.
         where: What to name in an error.
 
     Raises:
-        RecordingError: No YAML mapping, or a format that this version does not know.
+        RecordingError: No YAML mapping, a wrong value, or a format that this version does not
+            know.
     """
-    try:
-        note = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise RecordingError(f'{where}: the recording note is no valid YAML: {error}') from None
-    if not isinstance(note, dict):
-        msg = f'{where}: the recording note is a {type(note).__name__}; a mapping is needed'
-        raise RecordingError(msg)
-    if note.get('format', NOTE_FORMAT) != NOTE_FORMAT:
-        msg = f'{where}: note of format {note["format"]!r}; this version reads {NOTE_FORMAT!r}'
-        raise RecordingError(msg)
-    return note
+    return _checked_note(text, where, replace(NOTE, further=True))
+
+
+def load_note(path: str | Path) -> dict[str, Any]:
+    """A recording note from a YAML file that somebody wrote; its keys are those of the docs.
+
+    Raises:
+        RecordingError: As `parse_note`, or an unknown key.
+    """
+    return _checked_note(read_text(path, RecordingError), str(path), NOTE)
+
+
+def _checked_note(text: str, where: str, schema: Form) -> dict[str, Any]:
+    note = parse_yaml(text, where, RecordingError)
+    return schema.of(note, where, RecordingError)
 
 
 def _mechanism_of(path: Path, note: Mapping[str, Any]) -> channels.Mechanism:
-    if 'mechanism' not in note:
+    if not note.get('mechanism'):
         msg = (f'{path}: nothing says which mechanism was recorded; put a note with '
                f'`mechanism` and `setup` on {NOTE_TOPIC} or give one (--note note.yaml); '
                f'mechanisms are {", ".join(channels.MECHANISMS)}')

@@ -18,7 +18,7 @@ from typing import Any
 from rich.console import Console
 
 from cg_dynamics.model import Model
-from cg_sysid.bags import RawRecording, parse_note, read_raw, to_record
+from cg_sysid.bags import RawRecording, load_note, read_raw, to_record
 from cg_sysid.check_content import check_content
 from cg_sysid.check_dynamics import check_dynamics
 from cg_sysid.check_kinematics import check_kinematics
@@ -159,7 +159,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         region = dict(parse_region(text) for text in args.use_region)
-        note = parse_note(Path(args.note).read_text('utf-8'), args.note) if args.note else None
+        note = load_note(args.note) if args.note else None
         if args.model and not Path(args.model).is_file():
             raise RecordingError(f'{args.model}: no such model file')
     except (OSError, ValueError) as error:

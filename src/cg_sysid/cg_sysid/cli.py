@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from cg_sysid import parallel
-from cg_sysid.bags import parse_note
+from cg_sysid import bags, parallel
 from cg_sysid.report.wording import event_words, left_words, undetermined_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
@@ -117,7 +116,7 @@ def common_options(parser: argparse.ArgumentParser) -> None:
 
 def load_note(path: str | None) -> dict[str, Any] | None:
     """The recording note of a file; None if no file is named."""
-    return parse_note(Path(path).read_text('utf-8'), path) if path else None
+    return bags.load_note(path) if path else None
 
 
 def print_gain(console: Console, facts: Facts) -> None:

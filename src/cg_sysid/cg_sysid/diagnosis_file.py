@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 
 from cg_description.model_file import write_atomically
+from cg_description.reading import JSON, parse_json, read_text
+from cg_description.schema import Key, Text
+from cg_description.schema import Mapping as Form
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.model import Model
@@ -623,12 +626,7 @@ def read_facts(directory: str | Path) -> Facts:
         path = directory / name
         if not path.is_file():
             continue
-        try:
-            facts = json.loads(path.read_text(encoding='utf-8'))
-        except (OSError, ValueError) as error:
-            raise ValueError(f'{path}: not readable as JSON: {error}') from None
-        if not isinstance(facts, dict) or facts.get('format') != form:
-            found = facts.get('format') if isinstance(facts, dict) else None
-            raise ValueError(f'{path}: format is {found!r}, expected {form!r}')
-        return facts
+        schema = Form({'format': Key(Text((form,)))}, further=True)
+        text = read_text(path, limits=JSON)
+        return schema.of(parse_json(text, str(path)), str(path))
     raise ValueError(f'{directory}: neither {" nor ".join(FILE_NAMES.values())} in it')

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cg_description.reading import JSON, read_text, shown
 from cg_dynamics.settings import Settings, setting
 
 KINDS = ('none', 'multisine', 'chirp', 'steps', 'file')
@@ -161,21 +162,19 @@ def playback(path: Path) -> Signal:
     """
     rows: list[tuple[float, float]] = []
     titles = 0
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].lstrip().startswith('#'):
-                    continue
-                try:
-                    rows.append((float(row[0]), float(row[1])))
-                except (ValueError, IndexError):
-                    titles += 1
-                    if rows or titles > 1:
-                        raise ValueError(
-                            f'{path}:{number}: expected time in s, torque in N m; got {row}'
-                        ) from None
-    except OSError as error:
-        raise ValueError(f'cannot read command file {path}: {error.strerror}') from None
+    text = read_text(path, limits=JSON)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith('#'):
+            continue
+        try:
+            cells = next(csv.reader([line]))
+            rows.append((float(cells[0]), float(cells[1])))
+        except (ValueError, IndexError, csv.Error):
+            titles += 1
+            if rows or titles > 1:
+                raise ValueError(
+                    f'{path}:{number}: expected time in s, torque in N m; got {shown(line)}'
+                ) from None
     if not rows:
         raise ValueError(f'{path} holds no rows of time in s, torque in N m')
     times, torques = np.array(rows).T

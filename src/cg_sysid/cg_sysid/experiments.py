@@ -4,12 +4,14 @@ Each file of config/experiments is one experiment of docs/experiments.md. No ROS
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from cg_description.reading import parse_yaml, read_text
+from cg_description.schema import Key, Kind, ListOf, Number, Text, Whole
+from cg_description.schema import Mapping as Form
+from cg_dynamics import rig
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -18,6 +20,24 @@ from cg_sysid.excitation import ExcitationSettings
 
 class ExperimentError(ValueError):
     """An experiment that does not exist, is wrong, or did not go through."""
+
+
+def _kind_of(field: Field) -> Kind:
+    """What a setting may be in a file; its bounds are the settings' own to check."""
+    return {str: Text(), int: Whole(0), float: Number()}[type(field.default)]
+
+
+SCHEMA = Form({
+    'setup': Key(replace(rig.SCHEMA, fill=False), 'what is done to the rig'),
+    'initial_state': Key(ListOf(Number()), 'coordinates, then rates', unit='rad, rad/s'),
+    'duration': Key(Number(positive=True), unit='s'),
+    'excitation': Key(Form({
+        field.name: Key(_kind_of(field), default=field.default)
+        for field in fields(ExcitationSettings)
+        if field.name != 'duration'
+    }, fill=False)),
+    'description': Key(Text(), default=''),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,14 +86,11 @@ def load_experiment(name: str) -> Experiment:
         ExperimentError: naming what is wrong and what is allowed.
     """
     path = Path(name) if name.endswith('.yaml') else experiments_directory() / f'{name}.yaml'
-    try:
-        entries = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError:
+    if not path.is_file():
         known = ', '.join(experiment_names())
-        raise ExperimentError(f'no experiment {name!r}; there are: {known}') from None
-    except yaml.YAMLError as error:
-        raise ExperimentError(f'{path} is not YAML: {" ".join(str(error).split())}') from None
-    return parse_experiment(path, entries)
+        raise ExperimentError(f'no experiment {name!r}; there are: {known}')
+    text = read_text(path, ExperimentError)
+    return parse_experiment(path, parse_yaml(text, str(path), ExperimentError))
 
 
 def experiments_for(model: Model) -> list[Experiment]:
@@ -92,25 +109,20 @@ def experiments_for(model: Model) -> list[Experiment]:
 
 def parse_experiment(path: Path, entries: Any) -> Experiment:
     """An experiment from the content of its file."""
-    allowed = {field.name for field in fields(Experiment)} - {'name'}
-    needed = allowed - {'description'}
-    if not isinstance(entries, dict) or not needed <= set(entries) <= allowed:
-        raise ExperimentError(
-            f'{path}: expected the entries {", ".join(sorted(needed))} and maybe description'
-        )
-    excitation = dict(entries['excitation'])
-    if excitation.get('kind') == 'file':
+    tree = SCHEMA.of(entries, str(path), ExperimentError)
+    excitation = tree['excitation']
+    if excitation.get('kind') == 'file' and excitation.get('file'):
         excitation['file'] = str((path.parent / excitation['file']).resolve())
     try:
-        ExcitationSettings(**excitation, duration=float(entries['duration']))
-        setup = Setup.from_dict(entries['setup'])
-    except (ValueError, TypeError) as error:
+        ExcitationSettings(**excitation, duration=tree['duration'])
+        setup = Setup.from_dict(tree['setup'])
+    except ValueError as error:
         raise ExperimentError(f'{path}: {error}') from None
     return Experiment(
         name=path.stem,
         setup=setup,
-        initial_state=tuple(float(value) for value in entries['initial_state']),
-        duration=float(entries['duration']),
+        initial_state=tuple(tree['initial_state']),
+        duration=tree['duration'],
         excitation=excitation,
-        description=' '.join(str(entries.get('description', '')).split()),
+        description=' '.join(tree['description'].split()),
     )

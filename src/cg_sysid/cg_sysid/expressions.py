@@ -13,10 +13,13 @@ and optionally `gain` (a factor) and `offset` (in the unit of the result), appli
 value = gain * expression + offset.
 """
 
+from collections.abc import Mapping as Mapped
 from typing import Any
 
 import numpy as np
 
+from cg_description.reading import shown
+from cg_description.schema import Key, Kind, ListOf, Mapping, Number, Place, Text
 from cg_sysid.errors import RecordingError
 from cg_sysid.tables import Table
 
@@ -42,10 +45,46 @@ UNITS = {
 }
 COUNTS = 'counts'
 OPERATIONS = ('column', 'constant', 'sum', 'product', 'divide')
-MODIFIERS = ('unit', 'counts_per_rev', 'gain', 'offset')
 
 
-def evaluate(expression: Any, table: Table, where: str) -> np.ndarray:
+class Expression(Kind):
+    """An expression as it may stand in a mapping file; read as a mapping."""
+
+    words = 'a number, a column or a mapping with one of ' + ', '.join(OPERATIONS)
+
+    def read(self, value: Any, place: Place) -> dict[str, Any]:
+        """The expression as a mapping of one operation and its modifiers."""
+        if isinstance(value, str):
+            value = {'column': value}
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            value = {'constant': value}
+        if not isinstance(value, dict):
+            raise place.wrong(f'{shown(value)} is no expression; {self.words} is needed')
+        found = EXPRESSION.read(value, place)
+        operations = [key for key in OPERATIONS if key in found]
+        if len(operations) != 1:
+            raise place.wrong(f'exactly one of {", ".join(OPERATIONS)} is needed; '
+                              f'there {"are" if operations else "is"} '
+                              f'{", ".join(operations) or "none"}')
+        if found.get('unit') == COUNTS and 'counts_per_rev' not in found:
+            raise place.key('counts_per_rev').wrong(f'is missing; unit {COUNTS} needs it')
+        return found
+
+
+EXPRESSION = Mapping({
+    'column': Key(Text(), default=''),
+    'constant': Key(Number(), default=0.0),
+    'sum': Key(ListOf(Expression(), 2), default=()),
+    'product': Key(ListOf(Expression(), 2), default=()),
+    'divide': Key(ListOf(Expression(), 2, 2), default=()),
+    'unit': Key(Text((*UNITS, COUNTS)), default='1'),
+    'counts_per_rev': Key(Number(positive=True), default=1.0),
+    'gain': Key(Number(), default=1.0),
+    'offset': Key(Number(), default=0.0),
+}, fill=False)  # fmt: skip
+
+
+def evaluate(expression: Any, table: Mapped[str, np.ndarray], where: str) -> np.ndarray:
     """Values of an expression on every row of a table.
 
     Args:
@@ -57,78 +96,33 @@ def evaluate(expression: Any, table: Table, where: str) -> np.ndarray:
         Values, shape (N,).
 
     Raises:
-        RecordingError: The expression is malformed, or a column or unit is unknown.
+        RecordingError: The expression is malformed, or a column is unknown or no numbers.
     """
-    if isinstance(expression, str):
-        expression = {'column': expression}
-    if isinstance(expression, int | float) and not isinstance(expression, bool):
-        expression = {'constant': expression}
-    if not isinstance(expression, dict):
-        msg = f'{where}: {expression!r} is no expression; a number, a column or a mapping is'
-        raise RecordingError(msg)
-    operations = [key for key in expression if key in OPERATIONS]
-    unknown = [key for key in expression if key not in OPERATIONS + MODIFIERS]
-    if len(operations) != 1 or unknown:
-        msg = (f'{where}: exactly one of {", ".join(OPERATIONS)} and optionally '
-               f'{", ".join(MODIFIERS)} are allowed; got {", ".join(map(str, expression))}')
-        raise RecordingError(msg)
-    operation = operations[0]
+    table = table if isinstance(table, Table) else Table(table)
+    return _value(Expression().of(expression, where, RecordingError), table, where)
+
+
+def _value(expression: dict[str, Any], table: Table, where: str) -> np.ndarray:
+    operation = next(key for key in OPERATIONS if key in expression)
     value = _apply(operation, expression[operation], table, where)
-    value = value * _unit_factor(expression, where)
-    gain = _number(expression.get('gain', 1.0), f'{where}.gain')
-    offset = _number(expression.get('offset', 0.0), f'{where}.offset')
-    return gain * value + offset
+    unit = expression.get('unit', '1')
+    factor = 2.0 * np.pi / expression['counts_per_rev'] if unit == COUNTS else UNITS[unit]
+    with np.errstate(over='ignore', invalid='ignore'):  # the record refuses what is not finite
+        return expression.get('gain', 1.0) * (value * factor) + expression.get('offset', 0.0)
 
 
 def _apply(operation: str, operand: Any, table: Table, where: str) -> np.ndarray:
-    rows = len(next(iter(table.values())))
     if operation == 'constant':
-        return np.full(rows, _number(operand, where))
+        return np.full(table.length, operand)
     if operation == 'column':
-        return column(table, operand, where)
-    if not isinstance(operand, list) or len(operand) < 2:
-        raise RecordingError(f'{where}: {operation} needs a list of two or more expressions')
-    parts = [evaluate(e, table, f'{where}.{operation}[{k}]') for k, e in enumerate(operand)]
-    if operation == 'sum':
-        return np.sum(parts, axis=0)
-    if operation == 'product':
-        return np.prod(parts, axis=0)
-    if len(parts) != 2:
-        raise RecordingError(f'{where}: divide needs exactly two expressions, got {len(parts)}')
-    zeros = np.flatnonzero(parts[1] == 0.0)
-    if len(zeros):
-        raise RecordingError(f'{where}: division by zero in row {int(zeros[0])}')
-    return parts[0] / parts[1]
-
-
-def column(table: Table, name: Any, where: str) -> np.ndarray:
-    """A column of numbers.
-
-    Raises:
-        RecordingError: No such column, or it holds text.
-    """
-    if name not in table:
-        raise RecordingError(f'{where}: no column {name!r}; the file has {", ".join(table)}')
-    values = table[name]
-    if values.dtype.kind not in 'fiub':
-        raise RecordingError(f'{where}: column {name!r} holds text such as {str(values[0])!r}')
-    return values
-
-
-def _unit_factor(expression: dict, where: str) -> float:
-    unit = expression.get('unit', '1')
-    if unit == COUNTS:
-        per_rev = _number(expression.get('counts_per_rev'), f'{where}.counts_per_rev')
-        if per_rev <= 0:
-            raise RecordingError(f'{where}.counts_per_rev is {per_rev}; it must be positive')
-        return 2.0 * np.pi / per_rev
-    if unit not in UNITS:
-        msg = f'{where}: unit {unit!r} is not one of {", ".join([*UNITS, COUNTS])}'
-        raise RecordingError(msg)
-    return UNITS[unit]
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise RecordingError(f'{where} is {value!r}; a finite number is needed')
-    return float(value)
+        return table.numbers(operand, where)
+    parts = [_value(e, table, f'{where}.{operation}[{k}]') for k, e in enumerate(operand)]
+    with np.errstate(over='ignore', invalid='ignore'):
+        if operation == 'sum':
+            return np.sum(parts, axis=0)
+        if operation == 'product':
+            return np.prod(parts, axis=0)
+        zeros = np.flatnonzero(parts[1] == 0.0)
+        if len(zeros):
+            raise RecordingError(f'{where}: {table.place(zeros[0])}: division by zero')
+        return parts[0] / parts[1]

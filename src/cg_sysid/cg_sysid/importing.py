@@ -8,31 +8,142 @@ that come out are the same as those that the robot records.
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import numpy as np
-import yaml
 
+from cg_description.reading import parse_yaml, read_text, shown
+from cg_description.schema import (
+    NAME,
+    Key,
+    Kind,
+    ListOf,
+    MapOf,
+    Mapping,
+    Number,
+    Place,
+    Text,
+    Whole,
+)
+from cg_dynamics import rig
 from cg_dynamics.rig import Setup
 from cg_sysid import channels
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.errors import RecordingError
-from cg_sysid.expressions import column, evaluate
-from cg_sysid.raw import NOTE_FORMAT
+from cg_sysid.expressions import UNITS, Expression, evaluate
+from cg_sysid.raw import NOTE, NOTE_FORMAT
 from cg_sysid.record import NS_PER_S, Record
 from cg_sysid.tables import Table, read_table
 
 FORMAT = 'cg_import/1'
-ENTRIES = {
-    'format', 'title', 'source', 'files', 'mechanism', 'start', 'time', 'rows', 'split',
-    'channels', 'commands', 'cases', 'note', 'setup', 'nominal_rate_hz',
+LAST_STAMP_S = 2**31  # a ROS stamp counts seconds in 32 bits
+
+
+class NumberOrText(Kind):
+    """What a cell of a table may hold."""
+
+    words = 'a number or text'
+
+    def read(self, value: Any, place: Place) -> float | str:
+        """The number or text."""
+        if isinstance(value, str):
+            return Text().read(value, place)
+        return Number().read(value, place)
+
+
+class Patterns(Kind):
+    """One pattern of file names below a folder, or a list of them."""
+
+    words = "a pattern of file names such as '**/*.csv', or a list of them"
+
+    def read(self, value: Any, place: Place) -> list[str]:
+        """The patterns."""
+        patterns = ListOf(NAME, 1).read(value if isinstance(value, list) else [value], place)
+        for pattern in patterns:
+            # What pathlib takes, and nothing outside of the folder.
+            parts = pattern.split('/')
+            if not all(parts) or {'..', '.'} & set(parts) or parts.count('**') > 1 or any(
+                '**' in part and part != '**' for part in parts
+            ):
+                raise place.wrong(f'{shown(pattern)} is no pattern; {self.words} is needed')
+        return patterns
+
+
+class Start(Kind):
+    """The stamp of time 0: ISO 8601, or `{from_name: '%Y...'}` for a file named by its time."""
+
+    words = "an ISO 8601 time such as '2024-05-01T09:00:00Z', or {from_name: '%Y%m%d-%H%M%S'}"
+
+    def read(self, value: Any, place: Place) -> str | dict[str, str]:
+        """The time, or how to read the name."""
+        if isinstance(value, dict):
+            return Mapping({'from_name': Key(NAME)}).read(value, place)
+        text = Text().read(value, place)
+        try:
+            instant(text)
+        except ValueError:
+            raise place.wrong(f'{shown(value)} is no time; {self.words} is needed') from None
+        return text
+
+
+def instant(text: str) -> datetime:
+    """The time in ISO 8601, in UTC unless it says otherwise.
+
+    Raises:
+        ValueError: It is none.
+    """
+    found = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
+    return found if found.tzinfo else found.replace(tzinfo=timezone.utc)
+
+
+RULE = Mapping({
+    'column': Key(Text()),
+    'equals': Key(NumberOrText(), default=None),
+    'from': Key(Number(), default=None),
+    'below': Key(Number(), default=None),
+}, fill=False)  # fmt: skip
+SET_UP = replace(rig.SCHEMA, fill=False)
+CHANNELS = MapOf(Expression())
+CASE = {
+    'channels': Key(CHANNELS, default={}),
+    'commands': Key(CHANNELS, default={}),
+    'note': Key(NOTE, default={}),
+    'setup': Key(SET_UP, default={}),
 }
-CASE_ENTRIES = {'when', 'channels', 'commands', 'note', 'setup'}
+SCHEMA = Mapping({
+    'format': Key(Text((FORMAT,))),
+    'title': Key(Text(), default=''),
+    'source': Key(Mapping({}, further=True), default={}),
+    'files': Key(Patterns()),
+    'mechanism': Key(Text(tuple(channels.MECHANISMS))),
+    'start': Key(Start(), default='1970-01-01T00:00:00+00:00'),
+    'time': Key(Mapping({
+        'column': Key(Text(), default=''),
+        'unit': Key(Text(tuple(UNITS)), default='1'),
+        'rate_hz': Key(Number(positive=True), default=None, unit='Hz'),
+        'gain': Key(Number(), default=1.0),
+        'offset': Key(Number(), default=0.0, unit='s'),
+    }, fill=False)),
+    'rows': Key(ListOf(RULE), default=()),
+    'split': Key(Mapping({
+        'by': Key(ListOf(Text()), default=()),
+        'at': Key(ListOf(Mapping({'column': Key(Text()), 'value': Key(Number())})), default=()),
+        'name': Key(Text(longest=200), default='{name}_{stem}'),
+        'drop_first': Key(Whole(0), default=0),
+        'drop_last': Key(Whole(0), default=0),
+        'min_rows': Key(Whole(2), default=2),
+    }), default=None),
+    **CASE,
+    'cases': Key(ListOf(Mapping({'when': Key(RULE), **CASE})), default=()),
+    'nominal_rate_hz': Key(Number(positive=True), default=None, unit='Hz'),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -74,10 +185,10 @@ def load_mapping(name: str | Path) -> dict[str, Any]:
         name: Name of a mapping that comes with this package, or path of a YAML file.
 
     Returns:
-        The mapping, with its name under `name`.
+        The mapping with all defaults (`SCHEMA`), and its name under `name`.
 
     Raises:
-        RecordingError: No such mapping, not YAML, or an entry that is unknown or missing.
+        RecordingError: No such mapping, not YAML, or an entry that is unknown, missing or wrong.
     """
     path = Path(name)
     if path.suffix not in ('.yaml', '.yml'):
@@ -85,28 +196,21 @@ def load_mapping(name: str | Path) -> dict[str, Any]:
     if not path.is_file():
         msg = f'no mapping {str(name)!r}; those that come along are {", ".join(mapping_names())}'
         raise RecordingError(msg)
-    try:
-        mapping = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except yaml.YAMLError as error:
-        raise RecordingError(f'{path}: no valid YAML: {error}') from None
-    if not isinstance(mapping, dict) or mapping.get('format') != FORMAT:
-        raise RecordingError(f'{path}: a mapping with format: {FORMAT} is needed')
-    _check_entries(mapping, ENTRIES, str(path))
-    for key in ('files', 'mechanism', 'time'):
-        if key not in mapping:
-            raise RecordingError(f'{path}: entry {key!r} is missing')
-    for index, case in enumerate(mapping.get('cases', [])):
-        _check_entries(case, CASE_ENTRIES, f'{path}: cases[{index}]')
+    where = str(path)
+    tree = parse_yaml(read_text(path, RecordingError), where, RecordingError)
+    mapping = SCHEMA.of(tree, where, RecordingError)
+    if not {'column', 'rate_hz'} & set(mapping['time']):
+        raise RecordingError(f'{where}: time: a column or rate_hz is needed')
+    known = channels.mechanism(mapping['mechanism'])
+    cases = [(f'cases[{k}].', case) for k, case in enumerate(mapping['cases'])]
+    for at, part in [('', mapping), *cases]:
+        for key in ('channels', 'commands'):
+            for channel in part[key]:
+                try:
+                    known.channel(channel)
+                except ValueError as error:
+                    raise RecordingError(f'{where}: {at}{key}: {error}') from None
     return {**mapping, 'name': path.stem}
-
-
-def _check_entries(mapping: Any, allowed: set[str], where: str) -> None:
-    if not isinstance(mapping, dict):
-        raise RecordingError(f'{where}: {mapping!r} is no mapping')
-    unknown = sorted(set(mapping) - allowed)
-    if unknown:
-        msg = f'{where}: unknown entry {unknown[0]!r}; allowed are {", ".join(sorted(allowed))}'
-        raise RecordingError(msg)
 
 
 def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> Iterator[Imported]:
@@ -125,7 +229,7 @@ def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> I
     if not isinstance(mapping, dict):
         mapping = load_mapping(mapping)
     data_dir = Path(data_dir)
-    patterns = mapping['files'] if isinstance(mapping['files'], list) else [mapping['files']]
+    patterns = mapping['files']
     found = sorted({path for pattern in patterns for path in data_dir.glob(pattern)})
     if not found:
         raise RecordingError(f'{data_dir}: no file matches {", ".join(patterns)}')
@@ -137,71 +241,62 @@ def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> I
 
 def _parts(mapping: dict, table: Table, path: Path) -> Iterator[np.ndarray]:
     """Row indices of each part of a file."""
-    length = len(next(iter(table.values())))
-    keep = np.ones(length, dtype=bool)
-    for rule in mapping.get('rows', []):
-        keep &= _matches(rule, table, f'{path}: rows')
+    keep = np.ones(table.length, dtype=bool)
+    for number, rule in enumerate(mapping['rows']):
+        keep &= _matches(rule, table, f'{path}: rows[{number}]')
     rows = np.flatnonzero(keep)
     if not len(rows):
         raise RecordingError(f'{path}: no row is left after the filters in `rows`')
-    split = mapping.get('split') or {}
-    _check_entries(
-        split, {'by', 'at', 'name', 'drop_first', 'drop_last', 'min_rows'}, f'{path}: split'
-    )
+    split = mapping.get('split')
+    if split is None:
+        yield rows
+        return
     changes = np.diff(rows) != 1  # rows that were filtered out also end a part
-    if not split:
-        changes[:] = False
-    for name in split.get('by', []):
-        if name not in table:
-            raise RecordingError(f'{path}: split.by: no column {name!r}; '
-                                 f'the file has {", ".join(table)}')
-        changes |= table[name][rows][1:] != table[name][rows][:-1]
-    for border in split.get('at', []):
-        values = column(table, border.get('column'), f'{path}: split.at')[rows]
+    for name in split['by']:
+        values = table.values_of(name, f'{path}: split.by')[rows]
+        changes |= values[1:] != values[:-1]
+    for border in split['at']:
+        values = table.take(rows).numbers(border['column'], f'{path}: split.at')
         changes |= (values[:-1] < border['value']) & (values[1:] >= border['value'])
-    first, last = split.get('drop_first', 0), split.get('drop_last', 0)
     for part in np.split(rows, np.flatnonzero(changes) + 1):
-        kept = part[first:len(part) - last]
-        if len(kept) >= max(2, split.get('min_rows', 2)):
+        kept = part[split['drop_first']:max(0, len(part) - split['drop_last'])]
+        if len(kept) >= split['min_rows']:
             yield kept
 
 
-def _matches(rule: Any, table: Table, where: str) -> np.ndarray:
+def _matches(rule: dict[str, Any], table: Table, where: str) -> np.ndarray:
     """Which rows fulfil `{column: NAME, equals: V}` or `{column: NAME, from: A, below: B}`."""
-    _check_entries(rule, {'column', 'equals', 'from', 'below'}, where)
-    if rule.get('column') not in table:
-        raise RecordingError(f'{where}: no column {rule.get("column")!r}; '
-                             f'the file has {", ".join(table)}')
-    values = table[rule['column']]
-    matches = np.ones(len(values), dtype=bool)
+    matches = np.ones(table.length, dtype=bool)
     if 'equals' in rule:
-        matches &= values == rule['equals']
+        matches &= table.values_of(rule['column'], where) == rule['equals']
+    elif not {'from', 'below'} & set(rule):
+        raise RecordingError(f'{where}: nothing to compare with; allowed: equals, from, below')
     if 'from' in rule:
-        matches &= values >= rule['from']
+        matches &= table.numbers(rule['column'], where) >= rule['from']
     if 'below' in rule:
-        matches &= values < rule['below']
+        matches &= table.numbers(rule['column'], where) < rule['below']
     return matches
 
 
 def _record_of(
     mapping: dict, path: Path, table: Table, rows: np.ndarray, number: int
 ) -> Imported:
-    part = {name: values[rows] for name, values in table.items()}
+    part = table.take(rows)
     where = f'{path}: mapping {mapping["name"]}'
     entries = _with_case(mapping, part, where)
     mechanism = channels.mechanism(entries['mechanism'])
-    signals = _evaluated(entries.get('channels') or {}, part, f'{where}: channels', mechanism)
-    commands = _evaluated(entries.get('commands') or {}, part, f'{where}: commands', mechanism)
-    stamps = _stamps(entries, path, part, len(rows))
+    signals = _evaluated(entries['channels'], part, f'{where}: channels')
+    commands = _evaluated(entries['commands'], part, f'{where}: commands')
+    stamps = _stamps(entries, path, part)
     try:
-        setup = Setup.from_dict(entries.get('setup') or {})
+        setup = Setup.from_dict(entries['setup'])
     except ValueError as error:
         raise RecordingError(f'{where}: {error}') from None
-    source = {**(entries.get('source') or {}), 'file': path.name, 'mapping': mapping['name']}
-    note = {'format': NOTE_FORMAT, **(entries.get('note') or {}), 'imported_from': source}
-    rate = entries.get('nominal_rate_hz', (entries['time'] or {}).get('rate_hz'))
+    source = {**entries['source'], 'file': path.name, 'mapping': mapping['name']}
+    note = {'format': NOTE_FORMAT, **entries['note'], 'imported_from': source}
+    rate = entries['nominal_rate_hz'] or entries['time'].get('rate_hz')
     if rate:
-        note['nominal_rate_hz'] = float(rate)
+        note['nominal_rate_hz'] = rate
     is_input = {*mechanism.input_names, *mechanism.extra_input_names}
     record = Record(
         name=_part_name(mapping, path, part, number),
@@ -218,70 +313,87 @@ def _record_of(
 
 def _with_case(mapping: dict, part: Table, where: str) -> dict:
     """The mapping with the entries of the one case that every row of the part fulfils."""
-    cases = mapping.get('cases')
+    cases = mapping['cases']
     if not cases:
         return mapping
-    for case in cases:
-        if np.all(_matches(case.get('when', {}), part, f'{where}: when')):
-            merged = dict(mapping)
-            for key in CASE_ENTRIES - {'when'}:
-                merged[key] = {**(mapping.get(key) or {}), **(case.get(key) or {})}
-            return merged
+    for number, case in enumerate(cases):
+        if np.all(_matches(case['when'], part, f'{where}: cases[{number}].when')):
+            return {**mapping, **{key: {**mapping[key], **case[key]} for key in CASE}}
     raise RecordingError(f'{where}: a part of the file fulfils none of its {len(cases)} cases')
 
 
-def _evaluated(
-    expressions: dict, part: Table, where: str, mechanism: channels.Mechanism
-) -> dict[str, np.ndarray]:
-    values = {}
-    for name, expression in expressions.items():
-        mechanism.channel(name)
-        values[name] = evaluate(expression, part, f'{where}.{name}')
-    return values
+def _evaluated(expressions: dict, part: Table, where: str) -> dict[str, np.ndarray]:
+    return {
+        name: evaluate(expression, part, f'{where}.{name}')
+        for name, expression in expressions.items()
+    }
 
 
-def _stamps(entries: dict, path: Path, part: Table, length: int) -> np.ndarray:
+def _stamps(entries: dict, path: Path, part: Table) -> np.ndarray:
     """Stamps in ns, shape (N,), from the time column or a fixed rate, after `start`."""
-    start = _start(entries.get('start', '1970-01-01T00:00:00+00:00'), path)
     time = entries['time']
-    _check_entries(time, {'column', 'unit', 'rate_hz', 'gain', 'offset'}, f'{path}: time')
     if 'column' in time:
         expression = {key: value for key, value in time.items() if key != 'rate_hz'}
-        column(part, time['column'], f'{path}: time')
         seconds = evaluate(expression, part, f'{path}: time')
-        return start + np.rint(seconds * NS_PER_S).astype(np.int64)
-    if not time.get('rate_hz', 0) > 0:
-        raise RecordingError(f'{path}: time: a column or a positive rate_hz is needed')
-    return start + np.rint(np.arange(length) * (NS_PER_S / time['rate_hz'])).astype(np.int64)
+    else:
+        seconds = np.arange(part.length) / time['rate_hz']
+    start_ns = _start_ns(entries['start'], path)
+    stamp = seconds + start_ns / NS_PER_S
+    wrong = np.flatnonzero(~((stamp >= 0) & (stamp < LAST_STAMP_S)))  # NaN is wrong too
+    if len(wrong):
+        raise RecordingError(
+            f'{path}: time: {part.place(wrong[0])}: {seconds[wrong[0]]:g} s after the start is no '
+            'stamp; years 1970 to 2037 are allowed'
+        )
+    if 'column' in time:
+        return start_ns + np.rint(seconds * NS_PER_S).astype(np.int64)
+    counts = np.arange(part.length)
+    return start_ns + np.rint(counts * (NS_PER_S / time['rate_hz'])).astype(np.int64)
 
 
-def _start(start: Any, path: Path) -> int:
-    """Stamp of time 0 in ns: ISO 8601, or `{from_name: '%Y...'}` for a file named by its time."""
-    try:
-        if isinstance(start, dict):
-            instant = datetime.strptime(path.stem, start['from_name']).replace(tzinfo=timezone.utc)
-        elif isinstance(start, datetime):
-            instant = start
-        else:
-            instant = datetime.fromisoformat(start.replace('Z', '+00:00'))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f'{path}: start {start!r} cannot be read: {error}') from None
-    if instant.tzinfo is None:
-        instant = instant.replace(tzinfo=timezone.utc)
-    return int(instant.timestamp()) * NS_PER_S
+def _start_ns(start: str | dict[str, str], path: Path) -> int:
+    """Time 0 in ns since 1970."""
+    if isinstance(start, str):
+        begin = instant(start)
+    else:
+        form = start['from_name']
+        try:
+            begin = datetime.strptime(path.stem, form).replace(tzinfo=timezone.utc)
+        except (ValueError, re.error):
+            raise RecordingError(f'{path}: start.from_name: the name of the file cannot be read '
+                                 f'as a time of the form {shown(form)}') from None
+    since = begin - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    return since // timedelta(microseconds=1) * 1000
 
 
 def _part_name(mapping: dict, path: Path, part: Table, number: int) -> str:
     """Name of a part: the mapping's, the file's, its number, values that it was split by."""
-    template = (mapping.get('split') or {}).get('name')
-    if template is None:
-        return f'{mapping["name"]}_{path.stem}'
-    firsts = {name: _plain(values[0]) for name, values in part.items()}
+    template = (mapping.get('split') or {'name': '{name}_{stem}'})['name']
+    known = {name: _plain(values[0]) for name, values in part.items()}
+    known |= {'name': mapping['name'], 'stem': path.stem, 'part': number}
+    where = f'{path}: split.name {shown(template)}'
+    name = ''
     try:
-        return template.format(name=mapping['name'], stem=path.stem, part=number, **firsts)
-    except (KeyError, ValueError, IndexError) as error:
-        msg = f'{path}: split.name {template!r} cannot be filled: {error}'
-        raise RecordingError(msg) from None
+        # Not str.format: that follows attributes, and fills any width.
+        for literal, key, form, conversion in Formatter().parse(template):
+            name += literal
+            if key is None:
+                continue
+            if key not in known:
+                raise RecordingError(f'{where}: cannot be filled: there is no {shown(key)}; '
+                                     f'allowed are {", ".join(known)}')
+            if conversion or not re.fullmatch('(0?[1-9])?d?', form or ''):
+                raise RecordingError(f'{where}: only {{name}} and forms such as {{name:02d}} '
+                                     'are allowed')
+            value = known[key]
+            name += f'{value:{form}}' if isinstance(value, int) else str(value)
+    except ValueError as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f'{where}: the braces do not match') from None
+    if not re.fullmatch(r'[^/\\\x00-\x1f.][^/\\\x00-\x1f]{0,199}', name):
+        raise RecordingError(f'{where}: {shown(name)} is no name of a directory')
+    return name
 
 
 def _plain(value: Any) -> Any:

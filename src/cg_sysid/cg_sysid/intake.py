@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cg_dynamics.model import Model
-from cg_sysid.bags import read_raw, to_record
+from cg_sysid.bags import no_bag, read_raw, to_record
 from cg_sysid.check import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.faults import FaultSignal, fault_signals
@@ -133,7 +133,7 @@ def _distinct(bags: Sequence[str | Path]) -> dict[str, Path]:
         if not path.exists():
             raise RecordingError(f'{path}: no such bag')
         if not _storage(path):
-            raise RecordingError(f'{path}: not a bag (no .mcap or .db3 file in it)')
+            raise no_bag(path)
     resolved = [path.resolve() for path in paths]
     for path, place in zip(paths, resolved, strict=True):
         if resolved.count(place) > 1:

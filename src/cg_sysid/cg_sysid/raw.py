@@ -6,10 +6,29 @@ from typing import Any
 
 import numpy as np
 
+from cg_description.schema import NAME, Anything, Flag, Key, MapOf, Mapping, Number, Text
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import RecordingError
 
 NOTE_FORMAT = 'cg_recording/1'
+# docs/interfaces.md, "The recording note". The set-up has a reader of its own.
+NOTE = Mapping({
+    'format': Key(Text((NOTE_FORMAT,)), default=NOTE_FORMAT),
+    'experiment': Key(Text(), default=''),
+    'mechanism': Key(NAME, default=''),
+    'setup': Key(Mapping({}, further=True), default={}),
+    'nominal_rate_hz': Key(Number(0.0), default=0.0, unit='Hz'),
+    'sensor_zeros': Key(MapOf(Number()), default={}),
+    'zeroed_at': Key(Text(), default=''),
+    'initial_state': Key(Text(('rest', 'moving', 'unknown')), default='unknown'),
+    'model_file': Key(Text(), default=''),
+    'model_sha256': Key(Text(), default=''),
+    'software': Key(Text(), default=''),
+    'closed_loop': Key(Flag(), default=False),
+    'notes': Key(Text(), default=''),
+    'imported_from': Key(Mapping({}, further=True), default={}),
+    'derived_channels': Key(MapOf(Anything()), default={}),
+}, fill=False)  # fmt: skip
 
 
 @dataclass(frozen=True)

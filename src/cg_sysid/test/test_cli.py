@@ -128,6 +128,7 @@ def places(bags, model_file, tmp_path):
     """Names that the table of bad inputs refers to."""
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'file').write_text('text')
+    (tmp_path / 'log.csv').write_text('t,q\n0,1\n')
     tree = yaml.safe_load(model_file.read_text('utf-8'))
     wrong = {
         'unit': lambda t: t['parameters']['c1'].update(unit='kg'),
@@ -145,11 +146,17 @@ BAD = {
     'no such bag': ('--model {m} --out {tmp}/o {tmp}/none', '{tmp}/none: no such bag'),
     'an empty directory': (
         '--model {m} --out {tmp}/o {tmp}/empty',
-        '{tmp}/empty: not a bag (no .mcap or .db3 file in it)',
+        '{tmp}/empty: not a bag; a directory with metadata.yaml and .mcap or .db3 files is needed',
     ),
     'a file of another kind': (
         '--model {m} --out {tmp}/o {tmp}/file {a}',
-        '{tmp}/file: not a bag (no .mcap or .db3 file in it)',
+        '{tmp}/file: not a bag; a directory with metadata.yaml and .mcap or .db3 files is needed',
+    ),
+    'a log': (
+        '--model {m} --out {tmp}/o {tmp}/log.csv {a}',
+        '{tmp}/log.csv: a log, no bag; a mapping file says which column is which channel, then '
+        '`python3 -m cg_sysid.importing MAPPING.yaml {tmp} --out bags` makes bags of it '
+        '(docs/data.md, "Import of foreign logs")',
     ),
     'the same bag twice': ('--model {m} --out {tmp}/o {a} {a}', '{a}: given twice'),
     'one record only': (
@@ -173,12 +180,11 @@ BAD = {
                   '--rounds is 0; at least 1 is needed'),
     'no model': (
         '--model {tmp}/none.yaml --out {tmp}/o {a} {b}',
-        'cannot read model file {tmp}/none.yaml: [Errno 2] No such file or directory: '
-        "'{tmp}/none.yaml'",
+        '{tmp}/none.yaml: cannot be read: No such file or directory',
     ),
     'a model with a wrong unit': (
         '--model {tmp}/unit.yaml --out {tmp}/o {a} {b}',
-        "{tmp}/unit.yaml: parameters.c1: unit is 'kg', expected '1'",
+        "{tmp}/unit.yaml: parameters.c1.unit: 'kg' is not '1'",
     ),
     'a parameter out of range': (
         '--model {tmp}/range.yaml --out {tmp}/o {a} {b}',
@@ -186,11 +192,11 @@ BAD = {
     ),
     'a model of another format': (
         '--model {tmp}/form.yaml --out {tmp}/o {a} {b}',
-        "{tmp}/form.yaml: format is 'cg_model/9', expected 'cg_model/1'",
+        "{tmp}/form.yaml: format: 'cg_model/9' is not cg_model/1",
     ),
     'a note that is not there': (
         '--model {m} --out {tmp}/o --note {tmp}/none.yaml {a} {b}',
-        '{tmp}/none.yaml: No such file or directory',
+        '{tmp}/none.yaml: cannot be read: No such file or directory',
     ),
     'a file in the way': (
         '--model {m} --out {tmp}/file --effects torque_bias --rounds 1 --workers 1 {a} {b}',

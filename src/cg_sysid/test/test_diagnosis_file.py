@@ -106,9 +106,9 @@ def test_unusable_facts_have_the_same_fields(facts, intake, model_file):
 @pytest.mark.parametrize(
     ('text', 'error'),
     [
-        ('{"format": "cg_diagnosis/9"}', "format is 'cg_diagnosis/9', expected 'cg_diagnosis/1'"),
-        ('{"format": ', 'not readable as JSON'),
-        ('[]', "format is None, expected 'cg_diagnosis/1'"),
+        ('{"format": "cg_diagnosis/9"}', "format: 'cg_diagnosis/9' is not cg_diagnosis/1"),
+        ('{"format": ', 'not JSON: line 1, column 12'),
+        ('[]', 'an empty list is no mapping; a mapping with format is needed'),
     ],
 )
 def test_a_wrong_file_is_refused(tmp_path, text, error):

@@ -61,15 +61,15 @@ def test_expressions(expression, expected):
     ('expression', 'message'),
     [
         ('c', "x: no column 'c'; the file has a, b"),
-        ({'column': 'a', 'unit': 'furlong'}, "unit 'furlong' is not one of"),
-        ({'column': 'a', 'unit': 'counts'}, 'counts_per_rev is None'),
-        ({'product': ['a']}, 'two or more'),
-        ({'divide': ['a', 0]}, 'division by zero in row 0'),
-        ({'divide': ['a', 'b', 'b']}, 'exactly two'),
-        ({'column': 'a', 'eval': 'os.system'}, 'are allowed; got column, eval'),
+        ({'column': 'a', 'unit': 'furlong'}, "x: unit: 'furlong' is not one of"),
+        ({'column': 'a', 'unit': 'counts'}, 'counts_per_rev: is missing; unit counts needs it'),
+        ({'product': ['a']}, 'x: product: 1 entries; 2 or more are needed'),
+        ({'divide': ['a', 0]}, 'x: row 1: division by zero'),
+        ({'divide': ['a', 'b', 'b']}, 'x: divide: 3 entries; 2 are needed'),
+        ({'column': 'a', 'eval': 'os.system'}, "x: unknown entry 'eval'; allowed: column"),
         ({'column': 'a', 'constant': 1}, 'exactly one of'),
-        ({'column': 'a', 'gain': 'big'}, "x.gain is 'big'"),
-        ({'column': 'a', 'gain': True}, 'x.gain is True'),
+        ({'column': 'a', 'gain': 'big'}, "x: gain: 'big' is no number"),
+        ({'column': 'a', 'gain': True}, 'x: gain: true is no number'),
         (['a'], 'is no expression'),
         (None, 'is no expression'),
     ],
@@ -104,14 +104,20 @@ def test_structs_of_a_mat_file_have_dotted_columns(tmp_path):
         ('a.csv', '', 'empty'),
         ('a.csv', 't,q\n', 'empty'),
         ('a.csv', 't,q\n1,2\n3\n', 'line 3 has 1 fields'),
-        ('a.json', '{', 'no valid JSON'),
-        ('a.json', '[1, 2]', 'mapping of lists'),
+        ('a.csv', 't,t\n1,2\n', "the header has two columns 't'"),
+        ('a.csv', b't,q\n1,2\n3,4 \xb0\n', 'line 3: the byte 0xb0 is not UTF-8'),
+        ('a.csv', 't,q\n1,' + 'x' * 200_000, 'line 2: no CSV: field larger'),
+        ('a.json', '[{"t": 1}, {"t": 2, "q": 3}]', r"\[1\]: 'q' stands in some of the rows only"),
+        ('a.json', '{"t": [1, "two"]}', r"t\[1\]: 'two' is no number"),
+        ('a.json', '[' * 5000, 'more than 40 deep'),
+        ('a.json', '{', 'not JSON: line 1'),
+        ('a.json', '[1, 2]', r'\[0\]: 1 is no mapping'),
         ('a.mat', 'nothing', 'not a readable MAT'),
         ('a.xls', '', "suffix '.xls' is not one of"),
     ],
 )
 def test_bad_tables(tmp_path, name, content, message):
-    (tmp_path / name).write_text(content)
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(RecordingError, match=message):
         read_table(tmp_path / name)
 
@@ -158,6 +164,31 @@ def test_rows_can_be_chosen_and_time_can_be_a_rate(tmp_path):
     assert imported.record.note['nominal_rate_hz'] == 200.0
 
 
+def test_a_cell_that_is_no_number_is_named(tmp_path):
+    path = write_mapping(tmp_path, rows=[{'column': 'trial', 'from': 1}], time={'rate_hz': 200.0})
+    lines = LOG.split('\n')
+    lines[17] = lines[17].replace(',16,', ',n/a,')
+    (tmp_path / 'log.csv').write_text('\n'.join(lines))
+    message = r"angle: row 17 \(line 18\), column 'angle': the cell 'n/a' is no number"
+    with pytest.raises(RecordingError, match=message):
+        list(import_logs(path, tmp_path))
+    # Where the filters leave that row out, it does no harm.
+    path = write_mapping(tmp_path, rows=[{'column': 'trial', 'from': 2}], time={'rate_hz': 200.0})
+    (tmp_path / 'log.csv').write_text('\n'.join(lines))
+    assert len(next(import_logs(path, tmp_path)).record) == 10
+
+
+def test_more_dropped_than_there_is_leaves_nothing(tmp_path):
+    path = write_mapping(tmp_path, split={'by': ['trial'], 'drop_last': 13})
+    assert list(import_logs(path, tmp_path)) == []
+
+
+def test_a_fraction_of_a_second_counts(tmp_path):
+    path = write_mapping(tmp_path, start='2011-03-04T10:00:00.25Z', time={'rate_hz': 200.0})
+    (imported,) = import_logs(path, tmp_path)
+    assert imported.record.stamp_ns[0] == 1_299_232_800 * NS_PER_S + 250_000_000
+
+
 def test_a_record_can_be_cut_at_a_value(tmp_path):
     path = write_mapping(tmp_path, time={'rate_hz': 200.0},
                          split={'at': [{'column': 'angle', 'value': 12}], 'name': 'part_{part}'})
@@ -168,16 +199,31 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'format': 'other'}, 'format: cg_import/1 is needed'),
-        ({'files': None}, "entry 'files' is missing"),
+        ({'format': 'other'}, "format: 'other' is not cg_import/1"),
+        ({'files': None}, 'files: is missing'),
         ({'files': '*.bin'}, 'no file matches'),
         ({'colour': 'red'}, "unknown entry 'colour'"),
-        ({'mechanism': 'cart_pole'}, 'unknown mechanism'),
+        ({'mechanism': 'cart_pole'}, "mechanism: 'cart_pole' is not one of compass_gait"),
         ({'time': {'column': 'nope'}}, "no column 'nope'"),
-        ({'time': {}}, 'positive rate_hz'),
-        ({'start': 'yesterday'}, 'cannot be read'),
+        ({'time': {}}, 'time: a column or rate_hz is needed'),
+        ({'start': 'yesterday'}, "start: 'yesterday' is no time; an ISO 8601 time"),
+        ({'start': {'from_name': '%Y'}}, "start.from_name: the name of the file cannot be read"),
+        ({'start': '2040-01-01'}, r'time: row 1 \(line 2\): 0 s after the start is no stamp'),
+        ({'channels': ['angle']}, 'channels: a list of 1 is no mapping; a mapping from names to'),
+        ({'channels': None, 'time': {'rate_hz': 1.0}}, 'input torque is missing'),
+        ({'files': '/etc/*'}, "files: '/etc/.*' is no pattern"),
+        ({'files': '../*.csv'}, "is no pattern"),
+        ({'time': {'rate_hz': -1}}, 'time.rate_hz: -1 is not allowed; a positive number'),
+        ({'rows': [{'column': 'trial', 'from': 'a'}]}, r"rows\[0\].from: 'a' is no number"),
+        ({'rows': [{'column': 'trial'}]}, r'rows\[0\]: nothing to compare with'),
+        ({'split': {'by': 'trial'}}, "split.by: 'trial' is no list"),
+        ({'split': {'name': '{part:99999999d}'}}, 'only {name} and forms such as'),
+        ({'split': {'name': '{part.__class__}'}}, "there is no 'part.__class__'"),
+        ({'split': {'name': '{part'}}, 'braces do not match'),
+        ({'split': {'name': '../{part}'}}, "'../1' is no name of a directory"),
+        ({'note': {'zeroed': 'now'}}, "note: unknown entry 'zeroed'.*did you mean 'zeroed_at'"),
         ({'rows': [{'column': 'trial', 'equals': 77}]}, 'no row is left'),
-        ({'rows': [{'column': 'nope'}]}, "no column 'nope'"),
+        ({'rows': [{'column': 'nope', 'equals': 1}]}, "no column 'nope'"),
         ({'split': {'by': ['nope']}}, "no column 'nope'"),
         ({'split': {'by': ['trial'], 'name': '{nope}'}}, 'cannot be filled'),
         ({'cases': [{'when': {'column': 'trial', 'equals': 5}}]}, 'none of its 1 cases'),
