@@ -197,9 +197,10 @@ class _Builder:
                 if self.documents > 1:
                     self._refuse('a second document begins here; one is allowed')
             elif isinstance(event, yaml.AliasEvent):
-                if event.anchor is None or event.anchor not in self.anchors:
-                    self._refuse(f'the alias {shown(event.anchor)} has no anchor before it')
-                value, nodes = self.anchors[event.anchor]
+                name = str(event.anchor)
+                if name not in self.anchors:
+                    self._refuse(f'the alias {shown(name)} has no anchor before it')
+                value, nodes = self.anchors[name]
                 self._count(nodes)
                 self._put(value)
             elif isinstance(event, yaml.ScalarEvent):

@@ -170,7 +170,8 @@ class Text(Kind):
             quotes = '' if isinstance(value, list | dict) else '; write it in quotes'
             raise place.wrong(f'{shown(value)} is no text{quotes}')
         if self.choices and value not in self.choices:
-            raise place.wrong(f'{shown(value)} is not {self.words}{meant(value, self.choices)}')
+            hint = meant(value, self.choices) if len(self.choices) > 1 else ''
+            raise place.wrong(f'{shown(value)} is not {self.words}{hint}')
         if len(value) > self.longest:
             raise place.wrong(f'{shown(value)} is too long; {self.longest} characters are allowed')
         if any(c < ' ' and c not in '\n\t' for c in value):
@@ -299,6 +300,8 @@ class Mapping(Kind):
 
     def read(self, value: Any, place: Place) -> dict[str, Any]:
         """All known keys, those of the file in its order, then the others with their defaults."""
+        if value is None:
+            raise place.wrong(f'nothing is there; {self.words} is needed')
         if not isinstance(value, dict):
             raise place.wrong(f'{shown(value)} is no mapping; {self.words} is needed')
         if 'format' in self.keys:  # a file of another form is told as such, not by its keys
@@ -314,7 +317,7 @@ class Mapping(Kind):
         found = {
             name: self._entry(name, value, place)
             for name in order
-            if self.fill or name in value or self.keys[name].default is NEEDED
+            if self.fill or value.get(name) is not None or self.keys[name].default is NEEDED
         }
         return found | {name: Anything().read(entry, place.key(name))
                         for name, entry in others.items()}

@@ -44,7 +44,7 @@ def test_models_that_come_along_read_back(path):
     [
         ('[1, 2', 'here: not YAML'),
         ('just words', "here: 'just words' is no mapping; a mapping with format, name"),
-        ('', 'here: nothing is no mapping'),
+        ('', 'here: nothing is there; a mapping with format'),
         ('format: other/1', "here: format: 'other/1' is not cg_model/1"),
         ('a: 1', 'here: format: is missing; cg_model/1 is needed'),
         ('format: cg_model/1', 'name: is missing'),

@@ -21,6 +21,10 @@ PHASE_DRAWS = 64  # random phase sets, of which the one with the lowest peak is 
 Signal = Callable[[float], float]
 
 
+class CommandFileError(ValueError):
+    """A command file that cannot be played; the message says what, where and what is allowed."""
+
+
 @dataclass(frozen=True)
 class ExcitationSettings(Settings):
     """Parameters of an excitation."""
@@ -158,11 +162,11 @@ def playback(path: Path) -> Signal:
     """The torque of a CSV file, held between its rows; zero after the last row's time.
 
     Raises:
-        ValueError: naming file, line and what is wrong.
+        CommandFileError: naming file, line and what is wrong.
     """
     rows: list[tuple[float, float]] = []
     titles = 0
-    text = read_text(path, limits=JSON)
+    text = read_text(path, CommandFileError, JSON)
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith('#'):
             continue
@@ -172,16 +176,16 @@ def playback(path: Path) -> Signal:
         except (ValueError, IndexError, csv.Error):
             titles += 1
             if rows or titles > 1:
-                raise ValueError(
+                raise CommandFileError(
                     f'{path}:{number}: expected time in s, torque in N m; got {shown(line)}'
                 ) from None
     if not rows:
-        raise ValueError(f'{path} holds no rows of time in s, torque in N m')
+        raise CommandFileError(f'{path} holds no rows of time in s, torque in N m')
     times, torques = np.array(rows).T
     if not np.all(np.isfinite(times)) or not np.all(np.isfinite(torques)):
-        raise ValueError(f'{path} holds a number that is not finite')
+        raise CommandFileError(f'{path} holds a number that is not finite')
     if np.any(np.diff(times) <= 0.0):
-        raise ValueError(f'{path}: times must grow from row to row')
+        raise CommandFileError(f'{path}: times must grow from row to row')
     last = times[-1]
     held = _held(times, torques)
     return lambda time: held(time) if time <= last else 0.0

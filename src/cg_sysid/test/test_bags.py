@@ -213,7 +213,7 @@ def with_value(index, value):
         ({'note': {**NOTE, 'format': 'cg_recording/9'}}, "'cg_recording/9' is not cg_recording/1"),
         ({'note': {**NOTE, 'setup': {'stance': 'left'}}}, "stance: 'left' is not one of"),
         ({'note': '[1, 2]'}, 'a list of 2 is no mapping'),
-        ({'note': 'a: [1'}, '/experiment: not YAML: line 1, column'),
+        ({'note': 'a: [1'}, '/experiment: not YAML: line 2, column 1'),
         ({'note': {**NOTE, 'nominal_rate_hz': 'fast'}}, "nominal_rate_hz: 'fast' is no number"),
         ({'note': {**NOTE, 'sensor_zeros': [0.0]}}, 'sensor_zeros: a list of 1 is no mapping'),
         ({'note': {'format': 'cg_recording/1'}}, 'which mechanism was recorded'),

@@ -1,0 +1,504 @@
+"""Mutants of every file that people write or pass on, read by the readers that meet them.
+
+    ./cg exec python bench/fuzz_readers.py [--inputs 1000000] [--readers model note] [--write FILE]
+
+A mutant is a sound file with bytes or words changed, with entries deleted, renamed, swapped for
+odd values or wrapped, or with a bomb in it: deep nesting, aliases of aliases, endless numbers,
+texts, keys. A reader must take it, or refuse it by an error of its own: one line, short, without
+the words of the interpreter. Each mutant follows from reader and number alone (`--replay`).
+
+Counted are *crashes* (any other exception), *unclear* (an error of more than a line or 1000
+characters, or in the words of the interpreter), the longest CPU time and the growth of the
+process's largest memory over a whole run.
+"""
+
+import argparse
+import copy
+import functools
+import json
+import random
+import re
+import resource
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from cg_bringup.hidden import hidden_effects_file
+from cg_control.basin import SHIPPED, shipped_file
+from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_description.model_file import write_atomically
+from cg_description.paths import model_path, models_directory
+from cg_description.reading import DocumentError, parse_yaml, read_text
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_hardware.simulation import read_setup
+from cg_sysid.bags import load_note, parse_note
+from cg_sysid.diagnosis_file import read_facts
+from cg_sysid.errors import RecordingError
+from cg_sysid.excitation import CommandFileError, playback
+from cg_sysid.experiments import ExperimentError, experiments_directory, load_experiment
+from cg_sysid.importing import import_logs, mapping_folder
+from cg_sysid.tables import read_table
+
+OURS = (DocumentError, RecordingError, TrajectoryError, ExperimentError, DynamicsError,
+        CommandFileError)  # fmt: skip
+# Signs of an error that comes out of the interpreter or a library and not out of a reader.
+FOREIGN = re.compile(
+    r"<class|NoneType|object at 0x|dtype|Errno|invalid literal|could not convert|codec can't|"
+    r'Traceback|tuple index|unhashable|unexpected keyword|has no attribute|inhomogeneous'
+)
+ALLOWED_S, ALLOWED_MB = 1.0, 200.0
+
+MAPPING = """
+format: cg_import/1
+title: pendulum
+source: {repository: here, revision: 1}
+files: '*.csv'
+mechanism: pendulum
+start: '2011-03-04T10:00:00Z'
+time: {column: t_ms, unit: ms}
+rows: [{column: trial, from: 1, below: 5}]
+split: {by: [trial], at: [{column: t_ms, value: 25}], name: 'e_{trial:02d}_{part}', drop_first: 1}
+channels:
+  angle: {column: angle, unit: counts, counts_per_rev: 4096, gain: -1, offset: 0.1}
+  torque: {product: [volt, {column: duty, gain: 0.01}], gain: 0.5}
+commands: {torque: {divide: [volt, {constant: 2.0}]}}
+cases:
+- when: {column: trial, equals: 1}
+  setup: {stance: inner}
+- when: {column: trial, from: 2}
+  note: {experiment: second}
+note: {experiment: first, initial_state: unknown, sensor_zeros: {angle: 0.0}, closed_loop: false}
+nominal_rate_hz: 200.0
+"""
+LOG = 'trial,t_ms,angle,volt,duty\n' + ''.join(
+    f'{k // 10},{5 * (k % 10)},{k},{2 * k},{k % 7}\n' for k in range(60)
+)
+NOTE = """
+format: cg_recording/1
+experiment: spring_stabilised_inner
+mechanism: compass_gait
+setup:
+  stance: inner
+  fixture: none
+  springs:
+  - {body: inner, point: 1.0, anchor: [0.6, 1.0], stiffness: 400.0, free_length: 0.3}
+nominal_rate_hz: 500.0
+sensor_zeros: {imu_angle: 0.0, hip_angle: 0.0}
+zeroed_at: '2011-03-04T10:12:00Z'
+initial_state: rest
+model_file: compass_gait_mit.yaml
+closed_loop: false
+notes: free text
+imported_from: {repository: here, revision: 92546f6}
+"""
+SETUP = 'stance: outer\nsprings: [{body: outer, point: 1, anchor: [1, 1], stiffness: 9, ' \
+    'free_length: 0}]\non_blocks: false\n'
+KNOTS = 4
+TRAJECTORY = json.dumps({
+    'format': 'cg_trajectory/1',
+    'model_hash': '2fa92f5043244330',
+    'provenance': {'slope': 0.0, 'friction': 'planned', 'periodic': False, 'seconds': 1.5},
+    'phases': [
+        {
+            'stance': stance,
+            'time': [start + 0.1 * k for k in range(KNOTS)],
+            'states': [[0.1, -0.1, 0.5, k] for k in range(KNOTS)],
+            'rates': [[0.5, k, -0.25, 1e-3] for k in range(KNOTS)],
+            'torque': [0.5 * k for k in range(KNOTS)],
+            'gains': [[1.0, 2.0, 3.0, k] for k in range(KNOTS)],
+            'cost_to_go': [[[1.0] * 4] * 4] * KNOTS,
+        }
+        for stance, start in (('inner', 0.0), ('outer', 0.1 * (KNOTS - 1)))
+    ],
+})  # fmt: skip
+FACTS = json.dumps({
+    'format': 'cg_diagnosis/1', 'verdict': 'explained', 'summary': 'payload', 'findings': [],
+    'gain': {'hip_angle': {'before': 1.0, 'after': 0.1, 'unit': 'rad'}}, 'causes': [{'a': None}],
+})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader, and sound files that it takes.
+
+    Attributes:
+        read: Reads the file of that path.
+        name: Name of the file.
+        seeds: Sound contents.
+        share: Of all mutants, in parts.
+    """
+
+    read: Callable[[Path], object]
+    name: str
+    seeds: tuple[str, ...]
+    share: int = 1
+
+
+def _texts(folder: Path) -> tuple[str, ...]:
+    return tuple(path.read_text('utf-8') for path in sorted(folder.glob('*.yaml')))
+
+
+def _full_model() -> str:
+    model = Model.load(model_path('sydney_pendulum'))
+    return model.with_effect('backlash').with_effect('payload').text()
+
+
+def _read_mapping(path: Path) -> None:
+    (path.parent / 'log.csv').write_text(LOG)
+    for _ in import_logs(path, path.parent):
+        pass
+
+
+def _read_note(path: Path) -> None:
+    parse_note(read_text(path, RecordingError), path.name)
+    Setup.from_dict(load_note(path).get('setup') or {})
+
+
+def _read_facts(path: Path) -> None:
+    read_facts(path.parent)
+
+
+def _read_basins(path: Path) -> None:
+    SHIPPED.of(parse_yaml(read_text(path), path.name), path.name)
+
+
+def readers() -> dict[str, Reader]:
+    """All readers by name."""
+    basins, hidden = shipped_file(), hidden_effects_file()
+    return {
+        'model': Reader(Model.load, 'a.yaml', (*_texts(models_directory()), _full_model()), 3),
+        'mapping': Reader(_read_mapping, 'a.yaml', (*[MAPPING] * 6, *_texts(mapping_folder())), 3),
+        'trajectory': Reader(Trajectory.load, 'a.json', (TRAJECTORY,), 4),
+        'note': Reader(_read_note, 'a.yaml', (NOTE,), 3),
+        'setup': Reader(lambda path: read_setup(str(path)), 'a.yaml', (SETUP,), 2),
+        'experiment': Reader(
+            lambda path: load_experiment(str(path)), 'a.yaml', _texts(experiments_directory()), 2
+        ),
+        'results': Reader(_read_facts, 'diagnosis.json', (FACTS,), 1),
+        'settings': Reader(
+            _read_basins, 'a.yaml', (basins.read_text('utf-8'), hidden.read_text('utf-8')), 1
+        ),
+        'log (CSV)': Reader(read_table, 'a.csv', (LOG,), 2),
+        'log (JSON)': Reader(
+            read_table, 'a.json',
+            ('{"t": [0, 0.1, null], "q": [1, 2, 3]}', '{"entries": [{"t": 0, "q": 1.5}]}'), 2,
+        ),
+        'command file': Reader(playback, 'a.csv', ('# a\ntime,torque\n0.0,1.0\n0.5,-2.0\n',), 1),
+    }  # fmt: skip
+
+
+# Mutations
+
+ODD = (
+    '', '~', 'null', 'true', 'no', '0', '-1', '1', '1e-3', '1E400', '-.inf', '.nan', 'NaN',
+    'Infinity', '1e999', '0x1F', '0o17', '010', '1_000', '1:30', '9' * 400, '-' + '9' * 25,
+    '2011-99-99', '2011-03-04', "''", "'0.3'", '""', '"\\ud800"', '"\\0"', '[]', '{}', '[[]]',
+    '[1, 2]', '{a: 1}', '{"a": 1}', '[1, [2]]', '&a', '*a', '!!int 3', '!!python/name:os.system',
+    '<<', '=', '? x', '|', '>-', '%', '@', '`', '\t', '\x00', '\x1b[31m', '\u2028', '\ufeff', '§',
+    'x' * 300, 'inner', 'angle', 'kg', 'pendulum', 'format', 'name', '**', '../x', '/', '{x}',
+    '{part:99999999d}', '{part.__class__}', '{', '%Y%', 'a.b', '1;2', '"',
+)  # fmt: skip
+ODD_VALUES = (
+    None, True, False, 0, -1, 1, 2**31, 10**18, -(10**30), 10**399, 1e-320, 1e308, float('nan'),
+    float('inf'), '', ' ', '0.3', '1e-3', '9' * 400, 'x' * 300, '\x00', 'é\u2028', '2011-99-99', [],
+    {}, [[]], [None], [1.0, 'a'], {'a': {}}, {'value': 1.0, 'unit': 'kg'}, [{}, {}], 'inner',
+    'angle', '{part:99999d}', '../../x', '**/**', {'from_name': '%'}, {'column': 'angle'},
+)  # fmt: skip
+WORD = re.compile(rb'[\w.+-]+|[^\w\s]|\s+')
+
+
+def flip_bytes(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+    """A few bytes changed, inserted, taken out or doubled."""
+    out = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
+        k = rng.randrange(len(out) + 1)
+        kind = rng.randrange(6)
+        if kind == 0 and k < len(out):
+            out[k] ^= 1 << rng.randrange(8)
+        elif kind == 1 and k < len(out):
+            out[k] = rng.randrange(256)
+        elif kind == 2:
+            out[k:k] = rng.randbytes(rng.choice((1, 2, 8)))
+        elif kind == 3:
+            del out[k : k + rng.choice((1, 2, 10, 100))]
+        elif kind == 4:
+            out[k:k] = out[k : k + rng.choice((1, 5, 50))]
+        else:
+            del out[k:]
+    return bytes(out)
+
+
+def swap_words(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+    """A few words swapped for odd ones, taken out, doubled or exchanged."""
+    words = list(_words(data))
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        k, other = rng.randrange(len(words)), rng.randrange(len(words))
+        kind = rng.randrange(6)
+        if kind <= 2:
+            words[k] = rng.choice(ODD).encode()
+        elif kind == 3:
+            words[k] = b''
+        elif kind == 4:
+            words[k], words[other] = words[other], words[k]
+        else:
+            words[k] = words[other]
+    return b''.join(words)
+
+
+def swap_entries(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+    """The content with entries swapped for odd values, deleted, renamed, doubled or wrapped."""
+    text = _as_json(data)
+    if text is None:
+        return swap_words(data, rng, seeds)
+    tree = json.loads(text)
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        places = list(_places(tree))
+        if not places:
+            break
+        content, key = rng.choice(places)
+        kind = rng.randrange(8)
+        if kind <= 3:
+            content[key] = copy.deepcopy(rng.choice(ODD_VALUES))
+        elif kind == 4:
+            del content[key]
+        elif kind == 5 and isinstance(content, dict):
+            content[rng.choice(('x', key[:-1], key + 's', key.upper(), ''))] = content.pop(key)
+        elif kind == 6:
+            content[key] = rng.choice(([content[key]], {str(key): content[key]}, [content[key]] * 3))
+        else:
+            other, name = rng.choice(places)
+            content[key] = json.loads(json.dumps(other[name]))
+    # JSON is YAML; a number of 400 digits is written by hand.
+    return json.dumps(tree, ensure_ascii=rng.random() < 0.5).encode('utf-8', 'surrogatepass')
+
+
+@functools.cache
+def _as_json(data: bytes) -> str | None:
+    try:
+        return json.dumps(yaml.load(data, yaml.CSafeLoader), default=str)
+    except (ValueError, yaml.YAMLError):
+        return None
+
+
+@functools.cache
+def _words(data: bytes) -> tuple[bytes, ...]:
+    return tuple(WORD.findall(data))
+
+
+def _places(tree: object) -> Iterator[tuple]:
+    if isinstance(tree, dict | list):
+        for key in tree if isinstance(tree, dict) else range(len(tree)):
+            yield tree, key
+            yield from _places(tree[key])
+
+
+def splice(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+    """The head of one file and the tail of another."""
+    other = rng.choice(seeds).encode()
+    return data[: rng.randrange(len(data) + 1)] + other[rng.randrange(len(other) + 1) :]
+
+
+def _aliases_of_aliases(n: int) -> str:
+    """Nine to the power of 8, or of 20."""
+    levels = 8 if n < 1000 else 20
+    lines = ['a: &a0 [x, x, x, x, x, x, x, x, x]']
+    lines += [f'b{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, levels)]
+    return '\n'.join([*lines, f'name: *a{levels - 1}', ''])
+
+
+# Things that swell or nest, by how often.
+FUSES: tuple[Callable[[int], str], ...] = (
+    lambda n: '[' * n,
+    lambda n: '{a: ' * n,
+    lambda n: '{"a":' * n,
+    lambda n: '- ' * n,
+    lambda n: '? ' * n,
+    lambda n: '[' * n + ']' * n,
+    lambda n: '[[],' * n,
+    lambda n: '9' * n,
+    lambda n: '-' * n,
+    lambda n: '0.' + '0' * n + '1',
+    lambda n: '1e' + '9' * n,
+    lambda n: 'x' * n,
+    lambda n: '"' + 'x' * n,
+    lambda n: '"\\"' * n,
+    lambda n: "'" + "''" * n + "'",
+    lambda n: '[' + '1,' * n + '1]',
+    lambda n: '[' + '[],' * n + '1]',
+    lambda n: '[' + '{},' * n + '{}]',
+    lambda n: '{' + ','.join(f'"{k}":1' for k in range(n)) + '}',
+    lambda n: '{' + '"a":1,' * n + '"a":2}',
+    lambda n: '\n' * n,
+    lambda n: '#' * n,
+    lambda n: ' ' * n,
+    lambda n: '\t' * n,
+    lambda n: '|\n' + ' a\n' * n,
+    lambda n: '\n'.join(f'k{k}: {k}' for k in range(n)),
+    lambda n: '&a ' * n,
+    lambda n: '*a ' * n,
+    lambda n: '!!str ' * n,
+    lambda n: '%TAG !a! b\n' * n,
+    lambda n: '---\n' * n,
+    lambda n: '"' + '\\u0041' * n + '"',
+    lambda n: 'é' * n,
+    lambda n: '(' * n,
+    lambda n: ',' * n,
+    _aliases_of_aliases,
+    lambda n: '[' + ', '.join(f'&a{k} {k}' for k in range(n)) + ']',
+    lambda n: '[&a ' + 'x' * n + ', ' + '*a, ' * n + '*a]',
+    lambda n: '{' * n + '}' * n,
+    lambda n: '0' * n,
+    lambda n: '=\n' * n,
+    lambda n: '\n'.join(['1,2,3,4,5'] * n),
+    lambda n: '"a\n' * n,
+    lambda n: '[null,' * n,
+)
+
+
+def bomb(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+    """Something that swells or nests, in place of a word or of the whole."""
+    n = rng.choice((100, 1500, 1500, 20_000)) if rng.random() < 0.98 else 300_000
+    fuse = rng.choice(FUSES)(n)
+    if rng.random() < 0.3:
+        return fuse.encode()
+    words = list(_words(data))
+    words[rng.randrange(len(words))] = fuse.encode()
+    return b''.join(words)
+
+
+MUTATIONS = (flip_bytes, swap_words, swap_entries, splice, bomb)
+WEIGHTS = (30, 30, 30, 8, 2)
+
+
+def mutant(name: str, reader: Reader, number: int) -> bytes:
+    """The mutant of that number."""
+    rng = random.Random(f'{name} {number}')
+    data = rng.choice(reader.seeds).encode()
+    (change,) = rng.choices(MUTATIONS, WEIGHTS)
+    return change(data, rng, reader.seeds)
+
+
+# Judging
+
+
+@dataclass
+class Tally:
+    """What came of the mutants of one reader."""
+
+    inputs: int = 0
+    taken: int = 0
+    crashes: list[str] = field(default_factory=list)
+    unclear: list[str] = field(default_factory=list)
+    longest_s: float = 0.0
+    longest: int = 0
+    cpu_s: float = 0.0
+
+
+def complaint(error: Exception) -> str:
+    """What is wrong with an error; empty if it is one of ours, short and plain."""
+    message = str(error)
+    if not isinstance(error, OURS):
+        return 'crash'
+    if not message or '\n' in message or len(message) > 1000 or FOREIGN.search(message):
+        return 'unclear'
+    return ''
+
+
+def judge(name: str, reader: Reader, numbers: range, folder: Path) -> Tally:
+    """Read the mutants of these numbers."""
+    tally, path = Tally(), folder / reader.name
+    for number in numbers:
+        path.write_bytes(mutant(name, reader, number))
+        began = time.process_time()
+        try:
+            reader.read(path)
+            tally.taken += 1
+        except Exception as error:
+            fault = complaint(error)
+            if fault:
+                last = traceback.extract_tb(error.__traceback__)[-1]
+                place = f'{Path(last.filename).name}:{last.lineno}'
+                line = f'{name} {number}: {type(error).__name__} at {place}: {str(error)[:200]!r}'
+                (tally.crashes if fault == 'crash' else tally.unclear).append(line)
+        spent = time.process_time() - began
+        tally.cpu_s += spent
+        if spent > tally.longest_s:
+            tally.longest_s, tally.longest = spent, number
+    tally.inputs = len(numbers)
+    return tally
+
+
+def memory_mb() -> float:
+    """Largest memory of this process so far in MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def run(inputs: int, only: list[str] | None = None) -> Iterator[tuple[str, Tally, float]]:
+    """Reader, its tally and the growth of the largest memory in MB, for each reader."""
+    known = readers()
+    chosen = {name: known[name] for name in only or known}
+    parts = sum(reader.share for reader in chosen.values())
+    shared = Path('/dev/shm')
+    with tempfile.TemporaryDirectory(dir=shared if shared.is_dir() else None) as folder:
+        for name, reader in chosen.items():
+            here = Path(folder) / name
+            here.mkdir()
+            for seed in reader.seeds:
+                if name != 'settings':  # its two kinds of files exclude each other
+                    (here / reader.name).write_text(seed, 'utf-8')
+                    if name != 'mapping' or seed is MAPPING:  # the logs of the others are not here
+                        reader.read(here / reader.name)
+            before = memory_mb()
+            tally = judge(name, reader, range(inputs * reader.share // parts), here)
+            yield name, tally, memory_mb() - before
+
+
+def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument('--inputs', type=int, default=1_000_000)
+    options.add_argument('--readers', nargs='+', choices=readers(), metavar='READER')
+    options.add_argument('--replay', nargs=2, metavar=('READER', 'NUMBER'), help='show a mutant')
+    options.add_argument('--write', type=Path, metavar='FILE', help='write the table there')
+    given = options.parse_args()
+    if given.replay:
+        name, number = given.replay[0], int(given.replay[1])
+        sys.stdout.buffer.write(mutant(name, readers()[name], number))
+        return 0
+    lines = [
+        '# Mutated files', '',
+        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. {__doc__.split(chr(10), 1)[1]}'
+        .split('\n\n', 2)[0] + ' Mutants, crashes and unclear errors are counted; what they are '
+        'is said at the top of the script.', '',
+        '| reader | mutants | taken | crashes | unclear errors | longest, s CPU | CPU, s | '
+        'memory grew by, MB |',
+        '|---|---:|---:|---:|---:|---:|---:|---:|',
+    ]  # fmt: skip
+    bad, total = 0, Tally()
+    for name, tally, grown in run(given.inputs, given.readers):
+        for line in (*tally.crashes, *tally.unclear)[:20]:
+            print(line, file=sys.stderr)
+        bad += len(tally.crashes) + len(tally.unclear)
+        bad += tally.longest_s > ALLOWED_S or grown > ALLOWED_MB
+        total.inputs += tally.inputs
+        total.cpu_s += tally.cpu_s
+        lines.append(
+            f'| {name} | {tally.inputs} | {tally.taken} | {len(tally.crashes)} '
+            f'| {len(tally.unclear)} | {tally.longest_s:.3f} | {tally.cpu_s:.0f} | {grown:.0f} |'
+        )
+        print(lines[-1], f'longest: {tally.longest}', flush=True)
+        if given.write:
+            write_atomically(given.write, '\n'.join(lines) + '\n')
+    print(f'{total.inputs} inputs, {total.cpu_s:.0f} s of CPU in the readers, {bad} faults')
+    return 1 if bad else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
