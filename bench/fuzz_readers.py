@@ -65,7 +65,11 @@ mechanism: pendulum
 start: '2011-03-04T10:00:00Z'
 time: {column: t_ms, unit: ms}
 rows: [{column: trial, from: 1, below: 5}]
-split: {by: [trial], at: [{column: t_ms, value: 25}], name: 'e_{trial:02d}_{part}', drop_first: 1}
+split:
+  by: [trial]
+  at: [{column: t_ms, value: 25}]
+  name: 'e_{trial:02d}_{part}'
+  drop_first: 1
 channels:
   angle: {column: angle, unit: counts, counts_per_rev: 4096, gain: -1, offset: 0.1}
   torque: {product: [volt, {column: duty, gain: 0.01}], gain: 0.5}
@@ -272,7 +276,8 @@ def swap_entries(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> byt
         elif kind == 5 and isinstance(content, dict):
             content[rng.choice(('x', key[:-1], key + 's', key.upper(), ''))] = content.pop(key)
         elif kind == 6:
-            content[key] = rng.choice(([content[key]], {str(key): content[key]}, [content[key]] * 3))
+            value = content[key]
+            content[key] = rng.choice(([value], {str(key): value}, [value] * 3))
         else:
             other, name = rng.choice(places)
             content[key] = json.loads(json.dumps(other[name]))
@@ -474,9 +479,8 @@ def main() -> int:
         return 0
     lines = [
         '# Mutated files', '',
-        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. {__doc__.split(chr(10), 1)[1]}'
-        .split('\n\n', 2)[0] + ' Mutants, crashes and unclear errors are counted; what they are '
-        'is said at the top of the script.', '',
+        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. What mutants, crashes and '
+        'unclear errors are is said at the top of the script.', '',
         '| reader | mutants | taken | crashes | unclear errors | longest, s CPU | CPU, s | '
         'memory grew by, MB |',
         '|---|---:|---:|---:|---:|---:|---:|---:|',

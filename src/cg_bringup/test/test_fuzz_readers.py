@@ -1,5 +1,6 @@
 """Mutated files are taken or refused by one clear line: a small run of bench/fuzz_readers.py."""
 
+import contextlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -35,9 +36,7 @@ def test_bombs_do_not_go_off(fuse, tmp_path):
         for seed in ('', READERS[reader].seeds[0].replace('2', text, 1)):
             path.write_text(seed or text)
             began, before = fuzz.time.process_time(), fuzz.memory_mb()
-            try:
+            with contextlib.suppress(*fuzz.OURS):
                 READERS[reader].read(path)
-            except Exception as error:
-                assert fuzz.complaint(error) == '', error
             assert fuzz.time.process_time() - began < fuzz.ALLOWED_S
             assert fuzz.memory_mb() - before < fuzz.ALLOWED_MB

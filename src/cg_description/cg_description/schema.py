@@ -25,23 +25,40 @@ NEEDED = object()  # the default of a key that must be there
 _EXPONENT = re.compile(r'[-+]?[0-9]{1,20}(\.[0-9]{0,30})?[eE][-+]?[0-9]{1,3}')
 
 
-@dataclass(frozen=True)
 class Place:
-    """Where a value stands: file and path in it, and the kind of error to raise."""
+    """Where a value stands: file, path in it, and the kind of error to raise.
 
-    where: str
-    path: str = ''
-    error: type[Exception] = DocumentError
+    The path is put together only when it is needed, by an error.
+    """
+
+    __slots__ = ('above', 'error', 'step', 'where')
+
+    def __init__(
+        self,
+        where: str,
+        step: str | int = '',
+        error: type[Exception] = DocumentError,
+        above: 'Place | None' = None,
+    ):
+        self.where, self.step, self.error, self.above = where, step, error, above
+
+    @property
+    def path(self) -> str:
+        """Such as `effects[2].parameters.mass`."""
+        above = self.above.path if self.above else ''
+        if isinstance(self.step, int):
+            return f'{above}[{self.step}]'
+        name = self.step if len(self.step) <= SHOWN else f'{self.step[:SHOWN]}…'
+        name = name if name.isprintable() else repr(name)
+        return f'{above}.{name}' if above else name
 
     def key(self, name: str) -> 'Place':
         """The entry of that name."""
-        name = name if len(name) <= SHOWN else f'{name[:SHOWN]}…'
-        name = name if name.isprintable() else repr(name)
-        return Place(self.where, f'{self.path}.{name}' if self.path else name, self.error)
+        return Place(self.where, name, self.error, self)
 
     def item(self, index: int) -> 'Place':
         """The entry of that number, from 0."""
-        return Place(self.where, f'{self.path}[{index}]', self.error)
+        return Place(self.where, index, self.error, self)
 
     def wrong(self, message: str) -> Exception:
         """The error to raise."""
@@ -197,9 +214,8 @@ class Flag(Kind):
 
 @dataclass(frozen=True)
 class Anything(Kind):
-    """Plain data of any form; numbers must be finite unless told otherwise."""
+    """Plain data of any form, less numbers that are not finite."""
 
-    finite: bool = True
     words = 'anything'
 
     def read(self, value: Any, place: Place) -> Any:
@@ -208,7 +224,7 @@ class Anything(Kind):
             return {name: self.read(entry, place.key(name)) for name, entry in value.items()}
         if isinstance(value, list):
             return [self.read(entry, place.item(i)) for i, entry in enumerate(value)]
-        if self.finite and isinstance(value, float) and not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             raise place.wrong(f'{shown(value)} is not allowed; a finite number is needed')
         return value
 

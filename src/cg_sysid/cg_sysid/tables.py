@@ -10,7 +10,7 @@ import numpy as np
 import scipy.io
 
 from cg_description.reading import JSON_LOG, parse_json, read_text, shown
-from cg_description.schema import Anything, ListOf, MapOf, Number, meant
+from cg_description.schema import ListOf, Number, meant
 from cg_sysid.errors import RecordingError
 
 
@@ -165,14 +165,16 @@ def _read_json(path: Path) -> Table:
     if inside:
         content = content['entries']
     if isinstance(content, list):
-        rows = ListOf(MapOf(Anything(finite=False))).of(content, str(path), RecordingError, inside)
-        names = list(rows[0]) if rows else []
-        for k, row in enumerate(rows):
-            if set(row) != set(names):
-                other = sorted(set(row) ^ set(names))[0]
+        names = content[0].keys() if content and isinstance(content[0], dict) else set()
+        for k, row in enumerate(content):
+            if not isinstance(row, dict):
+                msg = f'{path}: {inside}[{k}]: {shown(row)} is no mapping from names to numbers'
+                raise RecordingError(msg)
+            if row.keys() != names:
+                other = min(row.keys() ^ names)
                 msg = f'{path}: {inside}[{k}]: {shown(other)} stands in some of the rows only'
                 raise RecordingError(msg)
-        content = {name: [row[name] for row in rows] for name in names}
+        content = {name: [row[name] for row in content] for name in names}
     elif not isinstance(content, dict):
         msg = f'{path}: a mapping of lists of numbers, or a list of mappings, is needed'
         raise RecordingError(msg)
