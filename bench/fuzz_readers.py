@@ -212,8 +212,8 @@ ODD = (
 )  # fmt: skip
 ODD_VALUES = (
     None, True, False, 0, -1, 1, 2**31, 10**18, -(10**30), 10**399, 1e-320, 1e308, float('nan'),
-    float('inf'), '', ' ', '0.3', '1e-3', '9' * 400, 'x' * 300, '\x00', 'é\u2028', '2011-99-99', [],
-    {}, [[]], [None], [1.0, 'a'], {'a': {}}, {'value': 1.0, 'unit': 'kg'}, [{}, {}], 'inner',
+    float('inf'), '', ' ', '0.3', '1e-3', '9' * 400, 'x' * 300, '\x00', 'é\u2028', '2011-99-99',
+    [], {}, [[]], [None], [1.0, 'a'], {'a': {}}, {'value': 1.0, 'unit': 'kg'}, [{}, {}], 'inner',
     'angle', '{part:99999d}', '../../x', '**/**', {'from_name': '%'}, {'column': 'angle'},
 )  # fmt: skip
 WORD = re.compile(rb'[\w.+-]+|[^\w\s]|\s+')
@@ -479,8 +479,8 @@ def main() -> int:
         return 0
     lines = [
         '# Mutated files', '',
-        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. What mutants, crashes and '
-        'unclear errors are is said at the top of the script.', '',
+        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. What mutants, crashes '
+        'and unclear errors are is said at the top of the script.', '',
         '| reader | mutants | taken | crashes | unclear errors | longest, s CPU | CPU, s | '
         'memory grew by, MB |',
         '|---|---:|---:|---:|---:|---:|---:|---:|',

@@ -34,7 +34,6 @@ setup(
         'matplotlib',
         'numpy',
         'scipy',
-        'PyYAML',
     ],
     extras_require={'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,

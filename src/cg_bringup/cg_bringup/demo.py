@@ -6,7 +6,6 @@ else, to the analysis in a process of its own, prints its verdict, and only then
 """
 
 import argparse
-import json
 import shutil
 import tempfile
 import time
@@ -24,6 +23,7 @@ from cg_description.paths import model_path
 from cg_dynamics.domains import own_domain
 from cg_dynamics.model import Model
 from cg_dynamics.stop_request import Stopped, stopped_by_signals
+from cg_sysid.diagnosis_file import read_facts
 from cg_sysid.experiments import ExperimentError, load_experiment
 
 # The last repeats the first with another excitation.
@@ -80,7 +80,7 @@ def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> di
     if status != 0 or not result.is_file():
         raise ExperimentError(f'the analysis ended with status {status}')
     console.print(f'({time.monotonic() - start:.1f} s)')
-    return json.loads(result.read_text(encoding='utf-8'))
+    return read_facts(out)
 
 
 def reveal(console: Console, nominal: Model, hidden: Hidden) -> None:

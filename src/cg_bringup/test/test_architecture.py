@@ -66,6 +66,24 @@ def test_only_nodes_and_the_ros_helpers_import_ros(package):
             assert not imports(path) & ROS, path.relative_to(SRC)
 
 
+# The one reader; what a process of our own answers through a pipe is no file.
+READERS = {'cg_description/reading.py', 'cg_control/basin_sampler.py'}
+
+
+@pytest.mark.parametrize('package', MAY_IMPORT)
+def test_yaml_and_json_are_read_by_the_one_reader(package):
+    for path in [*modules(package), *(SRC / package).glob('launch/*.py')]:
+        if '/'.join(path.parts[-2:]) in READERS:
+            continue
+        calls = {
+            f'{node.value.id}.{node.attr}'
+            for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+        }
+        foreign = {'yaml.load', 'yaml.safe_load', 'json.load', 'json.loads'}
+        assert not calls & foreign, path.relative_to(SRC)
+
+
 @pytest.mark.parametrize('package', MAY_IMPORT)
 def test_built_version_is_the_one_of_package_xml(package):
     manifest = ElementTree.parse(SRC / package / 'package.xml')

@@ -120,7 +120,7 @@ def test_gap_between_phases_is_refused(trajectory):
         ('{}', 'json: format: is missing; cg_trajectory/1 is needed'),
         ({'phases': [{'speed': 1}]}, r"phases\[0\]: unknown entry 'speed'; allowed: stance, time"),
         ({'model_hash': None}, 'model_hash: is missing'),
-        ({'phases': []}, 'phases: 0 entries; 1 or more are needed'),
+        ({'phases': []}, 'phases: an empty list; 1 or more entries are needed'),
         ({'phases': [{**PHASE, 'torque': [0, True]}]}, r'0\].torque\[1\]: true is no number'),
         ({'phases': [{**PHASE, 'states': [[0.0], [1.0, 2.0]]}]}, r'phases\[0\].states must be'),
         ({'phases': [{**PHASE, 'time': [1.0, 1.0]}]}, r'phases\[0\].time must hold at least two'),

@@ -29,7 +29,8 @@ QUANTITY = Mapping({
     'unit': Key(NAME, "SI unit, spelt as in the tables below; '1' for a ratio"),
     'tolerance': Key(
         Number(0.0), 'one standard deviation of what is believed about the value; without one '
-        'identification takes a wide guess', default=None, unit='as `unit`',
+        'identification believes a number of the mechanism to 15 % and one of an effect not at '
+        'all', default=None, unit='as `unit`',
     ),
     'fixed': Key(Flag(), 'true: identification leaves the number alone', default=False),
     'source': Key(Text(), 'where the number comes from', default=''),

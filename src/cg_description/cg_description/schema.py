@@ -124,7 +124,7 @@ class Number(Kind):
             quoted = isinstance(value, str) and re.fullmatch(r'[-+]?[0-9.]{1,40}', value)
             hint = '; numbers have no quotes' if quoted else f'; {self.words} is needed'
             raise place.wrong(f'{shown(value)} is no number{hint}')
-        if abs(value) > sys.float_info.max and not math.isinf(value):
+        if isinstance(value, int) and abs(value) > sys.float_info.max:
             raise place.wrong(f'{shown(value)}… is too large; {self.words} is needed')
         if not self.holds(value):
             raise place.wrong(f'{shown(value)} is not allowed; {self.words} is needed')
@@ -250,7 +250,7 @@ class ListOf(Kind):
         if len(value) < self.least or (self.most is not None and len(value) > self.most):
             exact = self.least == self.most
             needed = f'{self.least}' if exact else f'{self.least} or more'
-            raise place.wrong(f'{len(value)} entries; {needed} are needed')
+            raise place.wrong(f'{shown(value)}; {needed} entries are needed')
         if isinstance(self.kind, Number) and set(map(type, value)) <= {float, int}:
             # Trajectories hold many: the path of each is made only if one is wrong.
             with contextlib.suppress(OverflowError):
@@ -311,11 +311,17 @@ class Mapping(Kind):
     @property
     def words(self) -> str:  # type: ignore[override]
         """In words."""
-        needed = [name for name, key in self.keys.items() if key.default is NEEDED]
-        return f'a mapping with {", ".join(needed)}' if needed else 'a mapping'
+        return f'a mapping with {", ".join(self.needed)}' if self.needed else 'a mapping'
+
+    @property
+    def needed(self) -> list[str]:
+        """Keys that must be there."""
+        return [name for name, key in self.keys.items() if key.default is NEEDED]
 
     def read(self, value: Any, place: Place) -> dict[str, Any]:
         """All known keys, those of the file in its order, then the others with their defaults."""
+        if value is None and not self.needed:
+            value = {}
         if value is None:
             raise place.wrong(f'nothing is there; {self.words} is needed')
         if not isinstance(value, dict):

@@ -85,8 +85,10 @@ class Model:
             for channel, unit in zip(body.outputs, body.output_units, strict=True):
                 for name, q in file.sensors.get(channel, {}).items():
                     _same_unit(f'sensors.{channel}.{name}', q.unit, unit)
-                    _require(math.isfinite(q.value) and q.value >= 0,
-                             f'sensors.{channel}.{name}.value', q, 'a finite number of 0 or more')
+                    right = 0 <= q.value < math.inf if name == 'noise' else 0 < q.value < math.inf
+                    _require(right, f'sensors.{channel}.{name}.value', q,
+                             'a finite number of 0 or more' if name == 'noise'
+                             else 'a positive finite number')
             for channel, entries in file.actuators.items():
                 for name, q in entries.items():
                     _require(q.value > 0, f'actuators.{channel}.{name}.value', q,

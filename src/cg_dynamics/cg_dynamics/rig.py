@@ -75,7 +75,7 @@ class Setup:
             SetupError: naming the entry that is wrong and what is allowed.
         """
         values = SCHEMA.of(entries, '', SetupError, path='setup')
-        if 'stance' not in entries and values['fixture'] == 'outer_fixed':
+        if 'stance' not in (entries or {}) and values['fixture'] == 'outer_fixed':
             values['stance'] = 'outer'
         values['springs'] = tuple(
             Spring(**{**spring, 'anchor': tuple(spring['anchor'])}) for spring in values['springs']

@@ -78,6 +78,7 @@ def test_file_is_saved_whole(robot, tmp_path):
         (('sensors', 'sonar'), {}, "sensors: unknown entry 'sonar'; allowed: imu_angle"),
         (('sensors', 'imu_angle', 'noise', 'unit'), 'deg', "noise.unit: 'deg' is not 'rad'"),
         (('sensors', 'imu_angle', 'noise', 'value'), -1.0, 'noise.value: -1 is not allowed'),
+        (('sensors', 'hip_angle', 'resolution', 'value'), 0.0, 'resolution.value: 0 is not allow'),
         (('actuators', 'hip_torque', 'limit', 'value'), 0.0, 'limit.value: 0 is not allowed'),
         (('effects', 1, 'name'), 'coulomb_fricton', "did you mean 'coulomb_friction'"),
         (('sensors', 'imu_angle', 'smell'), {'value': 1, 'unit': '1'}, "unknown entry 'smell'"),

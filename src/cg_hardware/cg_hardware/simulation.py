@@ -141,8 +141,7 @@ def read_setup(text: str) -> Setup:
     source = text
     if text and '\n' not in text and ':' not in text:
         source = read_text(Path(text).expanduser())
-    entries = parse_yaml(source, 'setup')
-    return Setup.from_dict({} if entries is None else entries)
+    return Setup.from_dict(parse_yaml(source, 'setup'))
 
 
 def build_plant(settings: SimulationSettings, model: Model, setup: Setup) -> Plant:
