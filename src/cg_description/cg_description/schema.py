@@ -360,9 +360,7 @@ def meant(name: str, known: Any) -> str:
 
 
 def plural(words: str) -> str:
-    """`a finite number` -> `finite numbers`, as far as the kinds need it."""
-    words = words.removeprefix('a ')
-    first, _, rest = words.partition(' with ')
-    if first in ('text', 'mapping') or first.endswith('number'):
-        first += 's'
-    return f'{first} with {rest}' if rest else first
+    """`a finite number` -> `finite numbers`: the noun comes after at most two adjectives."""
+    return re.sub(
+        r'^(an? )?((\w+ ){0,1}?)(text|mapping|number|expression|list)\b', r'\2\4s', words, count=1
+    )

@@ -50,7 +50,7 @@ OPERATIONS = ('column', 'constant', 'sum', 'product', 'divide')
 class Expression(Kind):
     """An expression as it may stand in a mapping file; read as a mapping."""
 
-    words = 'a number, a column or a mapping with one of ' + ', '.join(OPERATIONS)
+    words = 'an expression'
 
     def read(self, value: Any, place: Place) -> dict[str, Any]:
         """The expression as a mapping of one operation and its modifiers."""
@@ -59,7 +59,8 @@ class Expression(Kind):
         if isinstance(value, int | float) and not isinstance(value, bool):
             value = {'constant': value}
         if not isinstance(value, dict):
-            raise place.wrong(f'{shown(value)} is no expression; {self.words} is needed')
+            raise place.wrong(f'{shown(value)} is no expression; a number, a column or a mapping '
+                              f'with one of {", ".join(OPERATIONS)} is needed')
         found = EXPRESSION.read(value, place)
         operations = [key for key in OPERATIONS if key in found]
         if len(operations) != 1:

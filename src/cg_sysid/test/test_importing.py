@@ -209,7 +209,7 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
         ({'start': 'yesterday'}, "start: 'yesterday' is no time; an ISO 8601 time"),
         ({'start': {'from_name': '%Y'}}, "start.from_name: the name of the file cannot be read"),
         ({'start': '2040-01-01'}, r'time: row 1 \(line 2\): 0 s after the start is no stamp'),
-        ({'channels': ['angle']}, 'channels: a list of 1 is no mapping; a mapping from names to'),
+        ({'channels': ['angle']}, 'channels: a list of 1 is no mapping; a mapping from names'),
         ({'channels': None, 'time': {'rate_hz': 1.0}}, 'input torque is missing'),
         ({'files': '/etc/*'}, "files: '/etc/.*' is no pattern"),
         ({'files': '../*.csv'}, "is no pattern"),
