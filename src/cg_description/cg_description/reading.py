@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ class Limits:
 
 
 YAML = Limits(size=1_000_000, depth=40, nodes=20_000)
-JSON = Limits(size=16_000_000, depth=40, nodes=500_000)
+JSON = Limits(size=8_000_000, depth=40, nodes=300_000)
 JSON_LOG = Limits(size=400_000_000, depth=40, nodes=20_000_000)  # of samples, not of settings
 
 
@@ -110,15 +110,8 @@ def parse_json(
 ) -> Any:
     """Plain data from JSON; otherwise as `parse_yaml`. NaN and Infinity are read as numbers."""
     _require_size(text, where, error, limits)
-    # A string may lack its end: then all that follows belongs to it, and no JSON comes of it.
-    structure = re.sub(r'"[^"\\]*(?:\\.[^"\\]*)*"?', '', text, flags=re.DOTALL)
-    if 1 + sum(map(structure.count, ',:[{')) > limits.nodes:
-        raise error(f'{where}: more than {limits.nodes} values, the most that is read')
-    brackets = re.sub(r'[^][{}]+', '', structure)
-    depths = accumulate(1 if bracket in '[{' else -1 for bracket in brackets)
-    if max(depths, default=0) > limits.depth:
-        raise error(f'{where}: lists and mappings lie more than {limits.depth} deep')
     try:
+        _require_structure(text, limits)
         tree = json.loads(text, object_pairs_hook=_mapping, parse_int=_integer)
         if re.search(r'\\u[dD][89a-fA-F]', text):
             json.dumps(tree, ensure_ascii=False).encode()
@@ -157,6 +150,9 @@ _NOTHING = object()
 # No more than PyYAML takes for numbers: a text that it writes without quotes must come back.
 _INTEGER = re.compile(r'[-+]?(0|[1-9][0-9]*)')
 _FLOAT = re.compile(r'[-+]?[0-9]+\.[0-9]*([eE][-+][0-9]+)?|\.[0-9]+([eE][-+][0-9]+)?')
+# A string may lack its end: then all that follows belongs to it, and no JSON comes of it.
+_STRING = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?', re.DOTALL)
+_BRACKET = re.compile(r'[][{}]')
 _WORDS = {
     **dict.fromkeys(('', '~', 'null', 'Null', 'NULL'), None),
     **dict.fromkeys(('true', 'True', 'TRUE', 'yes', 'Yes', 'YES', 'on', 'On', 'ON'), True),
@@ -282,6 +278,21 @@ def _resolved(text: str) -> Any:
         if _FLOAT.fullmatch(text):
             return float(text)
     return text
+
+
+def _require_structure(text: str, limits: Limits) -> None:
+    """Refuse JSON that nests too deep or holds too much, before anything is built."""
+    nodes, depth, end = 1, 0, 0
+    for string in chain(_STRING.finditer(text), (None,)):
+        between = text[end : string.start() if string else len(text)]
+        nodes += (string is not None) + sum(map(between.count, ',[{'))
+        if nodes > limits.nodes:
+            raise _Refused(f'more than {limits.nodes} values, the most that is read')
+        for bracket in _BRACKET.findall(between):
+            depth += 1 if bracket in '[{' else -1
+            if depth > limits.depth:
+                raise _Refused(f'lists and mappings lie more than {limits.depth} deep')
+        end = string.end() if string else end
 
 
 def _integer(text: str) -> int | float | str:
