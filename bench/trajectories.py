@@ -266,7 +266,9 @@ def agreement_lines(count: int) -> list[str]:
     feasible = 0
     for x0 in starts:
         task = task_from(x0)
+        began = time.perf_counter()
         said = screen(PLANT, task)
+        seconds = time.perf_counter() - began
         program = Program(PLANT, task, N)
         truth = any(
             program.solve(program.guess(guess), 100, 1e-6).converged for guess in GUESSES
@@ -279,7 +281,7 @@ def agreement_lines(count: int) -> list[str]:
             undecided += 1
             continue
         agree += (said.verdict == 'feasible') == truth
-        times[said.verdict].append(said.seconds)
+        times[said.verdict].append(seconds)
     decided = count - undecided
     return [
         f'Of {count} random starts, {feasible} feasible for the fine program from any of '

@@ -8,7 +8,6 @@ differ in durations and in the pose at the impact.
 """
 
 import math
-import time
 from dataclasses import dataclass
 
 from cg_control.program import GUESSES, WEAK, Program, Solution
@@ -28,12 +27,12 @@ class PlanningError(ValueError):
     """No motion was found.
 
     Attributes:
-        seconds: Time that was spent.
+        iterations: Of the solver that were spent.
     """
 
-    def __init__(self, message: str, seconds: float):
+    def __init__(self, message: str, iterations: int):
         super().__init__(message)
-        self.seconds = seconds
+        self.iterations = iterations
 
 
 class InfeasibleError(PlanningError):
@@ -44,7 +43,7 @@ class InfeasibleError(PlanningError):
 
 
 class UndecidedError(PlanningError):
-    """Time or iterations were over before the solver knew."""
+    """Iterations were over before the solver knew."""
 
 
 def planning_model(model: Model, friction: bool = True) -> Model:
@@ -92,7 +91,9 @@ class Options:
         coarse_iterations: Of one coarse solve.
         fine_iterations: Of the fine solve.
         tolerance: Of constraints and optimality, in the units of the scaled rows.
-        seconds: After which no further solve begins; a search cut short is undecided.
+        iterations: Of the solver in all solves, after which no further one begins; a search cut
+            short is undecided. The default never cuts the default search short. No clock takes
+            part, so that a plan does not depend on what else the machine does.
     """
 
     coarse: int = 8
@@ -101,7 +102,7 @@ class Options:
     coarse_iterations: int = 25
     fine_iterations: int = 100
     tolerance: float = 1e-6
-    seconds: float = 60.0
+    iterations: int = 1000
 
 
 @dataclass(frozen=True)
@@ -112,13 +113,13 @@ class Screening:
         verdict: 'feasible', 'infeasible' or 'undecided'.
         best: The cheapest motion found; None if there is none.
         miss: Least scaled distance by which goal and landing were missed, 0 if feasible.
-        seconds: Spent.
+        iterations: Of the solver that were spent.
     """
 
     verdict: str
     best: Solution | None
     miss: float
-    seconds: float
+    iterations: int
 
 
 def screen(model: Model, task: Task, options: Options | None = None) -> Screening:
@@ -134,7 +135,7 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
         options: How.
     """
     options = options or Options()
-    began = time.perf_counter()
+    spent = 0
     strict = Program(model, task, options.coarse)
     elastic: Program | None = None
     best: Solution | None = None
@@ -143,14 +144,16 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
     for number, guess in enumerate(GUESSES):
         if best is not None and number >= options.guesses:
             break
-        if time.perf_counter() - began > options.seconds:
+        if spent >= options.iterations:
             cut_short = True
             break
         found = strict.solve(strict.guess(guess), options.coarse_iterations, options.tolerance)
+        spent += found.iterations
         if not found.converged and best is None:
             elastic = elastic or Program(model, task, options.coarse, elastic=True)
             start = elastic.guess(guess) if number % 2 else elastic.ballistic(guess)
             near = elastic.solve(start, ELASTIC_ITERATIONS, options.tolerance)
+            spent += near.iterations
             miss = math.sqrt(max(near.cost - WEAK * elastic.running_cost(near), 0.0))
             if near.converged and miss > MISSED:
                 misses.append(miss)
@@ -158,6 +161,7 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
                     break
             elif near.converged:
                 found = strict.solve(near, options.coarse_iterations, options.tolerance)
+                spent += found.iterations
         if found.converged and (best is None or found.cost < best.cost):
             best = found
     if best is not None:
@@ -165,7 +169,7 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
     else:
         verdict = 'infeasible' if misses and not cut_short else 'undecided'
     miss = 0.0 if best else min(misses, default=math.inf)
-    return Screening(verdict, best, miss, time.perf_counter() - began)
+    return Screening(verdict, best, miss, spent)
 
 
 def optimise(
@@ -192,21 +196,22 @@ def optimise(
         raise InfeasibleError(
             f'no motion {what} within {limit:g} N m: the nearest misses goal or landing '
             f'by {coarse.miss:.2g} (1 is 0.1 rad or 0.3 rad/s)',
-            coarse.seconds,
+            coarse.iterations,
         )
     if coarse.best is None:
         raise UndecidedError(
             f'no motion {what} found within {options.guesses} guesses of '
-            f'{options.coarse_iterations} iterations or {options.seconds:g} s; there may be one',
-            coarse.seconds,
+            f'{options.coarse_iterations} iterations or {options.iterations} in all; '
+            'there may be one',
+            coarse.iterations,
         )
     fine = Program(planned, task, options.fine)
-    spent = coarse.seconds
+    spent = coarse.iterations
     starts = [coarse.best.resampled(options.fine), *map(fine.guess, GUESSES[: options.guesses])]
     for start in starts:
         found = fine.solve(start, options.fine_iterations, options.tolerance)
-        spent += found.seconds
-        if found.converged or spent > options.seconds:
+        spent += found.iterations
+        if found.converged or spent >= options.iterations:
             break
     if not found.converged:
         raise UndecidedError(
@@ -224,7 +229,7 @@ def optimise(
         intervals=options.fine,
         periodic=task.periodic,
         slope=task.slope,
-        seconds=round(spent, 4),
+        iterations=spent,
     )
 
 

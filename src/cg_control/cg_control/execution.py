@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cg_control.balance import BALANCING, FALLEN, BalanceController, BalanceSettings, Command
+from cg_control.nodes import Nodes
 from cg_control.tracking import Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import Trajectory
 from cg_dynamics.model import Model
@@ -80,9 +81,9 @@ class TrajectoryController:
             )
         last = trajectory.modes[-1]
         try:
-            self._tracker = Tracker(
-                trajectory, self.model, self.balance.gains[last][:4], self.settings
-            )
+            gain = self.balance.gains[last][:4]
+            nodes = Nodes.of(trajectory, self.model, gain, self.settings.late)
+            self._tracker = Tracker(nodes, self.model, self.settings)
         except ValueError as error:
             return str(error)
         return ''

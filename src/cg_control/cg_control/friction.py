@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from cg_dynamics.assemble import acting_effects, parameter_names, parameter_vector
 from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
 from cg_dynamics.settings import Settings, setting
 
 
@@ -46,25 +48,12 @@ class FrictionCompensation:
     """
 
     def __init__(self, model: Model):
-        rate, torque = ca.SX.sym('rate'), ca.SX(0)
-        for effect in model.effects:
-            names = [p.name for p in effect.parameters]
-            own = {n: model.values[f'{effect.label}.{n}'] for n in names}
-            if (
-                effect.place == 'joint'
-                and 'friction' in effect.name
-                and not (effect.states or effect.extra_inputs)
-                and effect.acts(own)
-            ):
-                added, _ = effect.joint_torque(
-                    ca.SX(0), rate, ca.SX(0), [], {n: ca.SX(v) for n, v in own.items()}
-                )
-                torque = torque - added
-        self._taken = ca.Function('friction', [rate], [torque])
+        self._taken = friction_torque(model)
+        self._p = parameter_vector(model, Setup())
 
     def taken(self, rate: float) -> float:
         """Torque in N m that friction takes at a hip rate in rad/s; it has the rate's sign."""
-        return float(self._taken(rate))
+        return float(self._taken(rate, self._p))
 
     def torque(self, rate: float, settings: FrictionSettings) -> float:
         """What is to be added to the command at a hip rate in rad/s, N m."""
@@ -76,3 +65,21 @@ class FrictionCompensation:
         fade = 1.0 if deadband == 0.0 else min(1.0, (speed - deadband) / deadband)
         limit = settings.friction_limit
         return settings.friction_share * fade * min(max(self.taken(rate), -limit), limit)
+
+
+def friction_torque(model: Model) -> ca.Function:
+    """(rate, p) -> tau_f of (FRIC), with the parameter vector of the model on either leg."""
+    names = parameter_names(model, Setup())
+    p = ca.SX.sym('p', len(names))
+    by_name = dict(zip(names, ca.vertsplit(p), strict=True))
+    rate, torque = ca.SX.sym('rate'), ca.SX(0)
+    for effect in acting_effects(model):
+        if (
+            effect.place == 'joint'
+            and 'friction' in effect.name
+            and not (effect.states or effect.extra_inputs)
+        ):
+            own = {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
+            added, _ = effect.joint_torque(ca.SX(0), rate, ca.SX(0), [], own)
+            torque = torque - added
+    return ca.Function('friction', [rate, p], [torque])

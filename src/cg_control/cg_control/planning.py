@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cg_control.collocation import Options, PlanningError, optimise, planning_model
+from cg_control.nodes import Nodes
 from cg_control.task import Task
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.trajectory import Trajectory
@@ -85,7 +86,8 @@ def executed(
         options: Of the simulation.
         balance: Gain after the end, shape (4,).
     """
-    tracker = Tracker(trajectory, known or robot, balance, settings)
+    model = known or robot
+    tracker = Tracker(Nodes.of(trajectory, model, balance, settings.late), model, settings)
 
     def command(t, stance, x):
         return np.array([tracker.torque(t, stance, x)])
@@ -178,7 +180,7 @@ def plan(
         raise RejectedError(
             f'the motion {" -> ".join(task.modes)} was planned but is not accepted: '
             f'{result.problem}',
-            trajectory.provenance['seconds'],
+            trajectory.provenance['iterations'],
         )
     return trajectory.with_phases(
         trajectory.phases,

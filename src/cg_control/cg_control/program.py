@@ -221,8 +221,11 @@ class Program:
             )  # fmt: skip
         except RuntimeError as error:  # what the solver throws where it meets no number
             log.debug('fatrop gave up: %s', error)
-            seconds = time.perf_counter() - began
-            return replace(start, converged=False, violation=math.inf, seconds=seconds)
+            # How many iterations it made is not known then; a budget counts them all.
+            return replace(
+                start, converged=False, violation=math.inf, iterations=iterations,
+                seconds=time.perf_counter() - began,
+            )  # fmt: skip
         seconds = time.perf_counter() - began
         z, g = (np.asarray(result[name]).ravel() for name in ('x', 'g'))
         violation = max(

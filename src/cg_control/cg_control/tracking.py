@@ -1,4 +1,4 @@
-"""Following a trajectory: u = u0(s) - K(s) (x - x0(s)), and what happens around an impact.
+"""Following nodes: u = u0(s) - K(s) (x - x0(s)), and what happens around an impact.
 
 The clock of TVLQR is its weakness (thesis, 4.5): gains and reference belong to an instant, and
 if the robot lands earlier or later they belong to the wrong leg. The remedies differ in s:
@@ -10,7 +10,8 @@ if the robot lands earlier or later they belong to the wrong leg. The remedies d
     phase   as event, and s follows the robot: it runs faster or slower towards the point of the
             reference that is closest in the metric of the cost to go
 
-After the end the balance controller of the last leg takes over.
+`event` and `phase` are one law, (FOL) of docs/trajectories.md, which is written twice: here for
+one robot that lives, and in rollouts.c for thousands that are simulated.
 """
 
 import math
@@ -18,17 +19,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_control.collocation import planning_model
 from cg_control.friction import FrictionCompensation
-from cg_control.trajectory import Phase, Trajectory
-from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
+from cg_control.nodes import LATE, Nodes
+from cg_control.trajectory import Trajectory
 from cg_dynamics.model import Model
-from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rig import STANCES
 from cg_dynamics.settings import Settings, setting
 
 REMEDIES = ('clock', 'blank', 'event', 'phase')
-LATE_KNOT = 0.01  # s between knots of the reference beyond a late impact
+STILL = 1e-3  # at rest every phase is equally close: this much of trace(S) counts against that
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class TrackingSettings(Settings):
         minimum=0.0, maximum=1.0, live=True,
     )  # fmt: skip
     late: float = setting(
-        0.3, 'event, phase: how long the reference goes on while an impact is late', unit='s',
+        LATE, 'event, phase: how long the reference goes on while an impact is late', unit='s',
         minimum=0.0, maximum=1.0, live=True,
     )  # fmt: skip
     pull: float = setting(
@@ -56,143 +55,159 @@ class TrackingSettings(Settings):
     )  # fmt: skip
     feedback: bool = setting(True, 'off: the nominal torque alone, played back', live=True)
 
+    @property
+    def by_clock(self) -> bool:
+        """Whether the phase goes on with time alone, whatever leg stands."""
+        return self.remedy in ('clock', 'blank') or not self.feedback
+
+    @property
+    def pulled(self) -> float:
+        """The pull of (FOL), 1/s: `event` is `phase` without any."""
+        return self.pull if self.remedy == 'phase' else 0.0
+
 
 class Tracker:
-    """A trajectory under feedback. The same object runs in the nodes, the benches and the tests.
+    """Nodes under feedback. The same object runs in the nodes, the benches and the tests.
 
     Args:
-        trajectory: With gains.
-        model: The robot as the controller knows it: its torque limit, its friction, and the motion
-            of the reference beyond a late impact.
-        balance: Gain of the balance controller on the last leg, shape (4,); None takes the last
-            gain of the trajectory.
+        nodes: What is followed.
+        model: The robot as the controller knows it: its torque limit and its friction.
         settings: May be replaced between steps.
+        start: Node to begin at; None takes the first of the trajectory that came last.
+
+    Attributes:
+        node: The reference is on the way from this node to the next,
+        elapsed: since so many seconds.
     """
 
     def __init__(
         self,
-        trajectory: Trajectory,
+        nodes: Nodes,
         model: Model,
-        balance: np.ndarray | None = None,
         settings: TrackingSettings | None = None,
+        start: int | None = None,
     ):
-        trajectory.require_model(model)
-        self.trajectory, self.settings = trajectory, settings or TrackingSettings()
+        self.nodes, self.settings = nodes, settings or TrackingSettings()
         self.limit = model.torque_limit
-        self.balance = trajectory.phases[-1].gains[-1] if balance is None else balance
-        compensate = trajectory.provenance.get('friction') == 'to be compensated'
-        self._friction = FrictionCompensation(model) if compensate else None
-        self._phases = [
-            _extended(phase, model, trajectory, self.settings.late)
-            for phase in trajectory.phases[:-1]
-        ] + [trajectory.phases[-1]]
-        self.reset()
+        self._friction = FrictionCompensation(model) if nodes.compensate else None
+        self._edges, self._nx = nodes.edges, nodes.x0.shape[1]
+        # Python's own numbers: a step looks at a handful, and numpy's take long to get at.
+        self._span, self._next = nodes.span.tolist(), nodes.next.tolist()
+        self._landing, self._stance = nodes.landing.tolist(), nodes.stance.tolist()
+        self._planned, self._impact = nodes.planned.tolist(), nodes.impact.tolist()
+        self.begin(nodes.first if start is None else start)
 
-    def reset(self) -> None:
-        """Begin anew at the next step."""
-        self._index = 0
-        self._begun: float | None = None
-        self._last = 0.0
-        self.s = self.trajectory.phases[0].start
+    def begin(self, node: int, elapsed: float = 0.0) -> None:
+        """Begin anew at the next step.
+
+        Args:
+            node: Where the reference is then,
+            elapsed: or so much later on the way to the next node, s.
+        """
+        if not 0 <= node < len(self.nodes):
+            raise ValueError(f'node is {node}; there are nodes 0 to {len(self.nodes) - 1}')
+        if not 0.0 <= elapsed < math.inf:
+            raise ValueError(f'elapsed is {elapsed} s; it must be a number and not negative')
+        self.node, self.elapsed = node, elapsed
+        self._last: float | None = None
+        self._since_impact = math.inf
 
     @property
     def done(self) -> bool:
-        """Whether the end of the trajectory has been reached."""
-        return self.s >= self.trajectory.phases[-1].end
+        """Whether a root has been reached: what goes on is the balance controller."""
+        return self._planned[self.node] < 0
+
+    @property
+    def s(self) -> float:
+        """Instant of the reference on the clock of its trajectory, s."""
+        return float(self.nodes.time[self.node]) + self.elapsed
+
+    def left(self, stance: str) -> bool:
+        """Whether the leg that stands belongs to another plan: it landed where none was planned.
+
+        The torque is zero then.
+        """
+        return STANCES[self._stance[self.node]] != stance and not self.settings.by_clock
 
     def torque(self, t: float, stance: str, x: np.ndarray) -> float:
-        """Hip torque in N m; zero for a state that is not finite.
+        """Hip torque in N m; zero for a state that is not finite, or when the plan is left.
 
         Args:
-            t: Any clock in s; the first call is the start of the trajectory.
+            t: Any clock in s; the first call is the start.
             stance: The leg that stands.
-            x: (q_inner, q_outer) and rates, shape (4,).
+            x: (q_inner, q_outer) and rates, shape (nx,) or longer.
         """
-        x = np.asarray(x, float)[:4]
-        if not np.isfinite(x).all():
+        x = np.asarray(x, float)[: self._nx]
+        if not math.isfinite(x.sum()):
             return 0.0
-        if self._begun is None:
-            self._begun = self._last = t
-        self._advance(t, stance, x)
+        elapsed = 0.0 if self._last is None else t - self._last
         self._last = t
-        if self.done:
-            return self._limited(-float(self.balance @ x) + self._taken(x[2] - x[3]))
-        point = self._phases[self._index].at(self.s)
-        wanted = point.torque + self._taken(point.state[2] - point.state[3])
-        if self.settings.feedback and not self._blanked():
-            wanted -= float(point.gain @ (x - point.state))
-        return self._limited(wanted)
+        self._advance(elapsed, STANCES.index(stance), x)
+        if self.left(stance):
+            return 0.0
+        reference = self._reference()
+        wanted = reference.item(0)
+        if self._friction:
+            wanted += self._friction.taken(x.item(2) - x.item(3))
+        if self.done or (self.settings.feedback and not self._blanked()):
+            nx = self._nx
+            wanted -= reference[1 + nx :].dot(x - reference[1 : 1 + nx]).item()
+        return min(max(wanted, -self.limit), self.limit)
 
-    def _taken(self, rate: float) -> float:
-        return self._friction.taken(rate) if self._friction else 0.0
+    def _reference(self) -> np.ndarray:
+        """(u0, x0, K) at the point of the reference, shape (1 + 2 nx,)."""
+        s = self.elapsed
+        return np.array((1.0, s, s * s, s * s * s)).dot(self._edges[self.node])
 
-    def _limited(self, torque: float) -> float:
-        return min(max(torque, -self.limit), self.limit)
-
-    def _blanked(self) -> bool:
-        return self.settings.remedy == 'blank' and any(
-            abs(self.s - t) <= self.settings.window for t in self.trajectory.impact_times
-        )
-
-    def _advance(self, t: float, stance: str, x: np.ndarray) -> None:
-        """Move the phase on to the instant t."""
-        phases = self.trajectory.phases
-        elapsed = t - self._last
-        if self.settings.remedy in ('clock', 'blank') or not self.settings.feedback:
-            self.s = phases[0].start + t - (self._begun or 0.0)
-            self._index = self.trajectory.index_at(self.s)
-            return
-        following = self._index + 1
-        if following < len(phases) and stance == phases[following].stance:
-            self._index, self.s = following, phases[following].start
-            return
-        rate = self._rate(x) if self.settings.remedy == 'phase' else 1.0
-        self.s = min(self.s + rate * elapsed, self._phases[self._index].end)
+    def _advance(self, elapsed: float, leg: int, x: np.ndarray) -> None:
+        """Move the reference on by the time since the last step."""
+        node = self.node
+        if self.settings.by_clock:
+            self._since_impact += elapsed
+            self.elapsed += elapsed
+            while self._impact[node] or self.elapsed >= self._span[node]:
+                if self._planned[node] < 0:
+                    break
+                if self._impact[node]:
+                    self._since_impact = self.elapsed
+                else:
+                    self.elapsed -= self._span[node]
+                node = self._planned[node]
+        elif leg != self._stance[node]:
+            if self._landing[node] >= 0:
+                node, self.elapsed = self._landing[node], 0.0
+        else:
+            self.elapsed += self._rate(x) * elapsed
+        while self.elapsed >= self._span[node]:
+            self.elapsed -= self._span[node]
+            node = self._next[node]
+        self.node = node
 
     def _rate(self, x: np.ndarray) -> float:
         """ds/dt that brings the reference nearer to the closest point: Newton's step, limited."""
-        phase = self._phases[self._index]
-        point, step = phase.at(self.s), 1e-3
-        ahead, behind = phase.at(self.s + step), phase.at(self.s - step)
-        span = min(self.s + step, phase.end) - max(self.s - step, phase.start)
-        tangent = (ahead.state - behind.state) / span
-        S = point.cost_to_go
-        # At rest every phase is equally close: there the clock alone counts.
-        length = tangent @ S @ tangent + 1e-3 * np.trace(S)
-        offset = tangent @ S @ (x - point.state) / length
-        rate = 1.0 + self.settings.pull * offset
-        return min(max(rate, 1 / self.settings.fastest), self.settings.fastest)
+        pull = self.settings.pulled
+        if pull == 0.0:
+            return 1.0
+        s, edge, nx = self.elapsed, self._edges[self.node], self._nx
+        tangent = np.array((0.0, 1.0, 2 * s, 3 * s * s)).dot(edge[:, 1 : 1 + nx])
+        deviation = x - np.array((1.0, s, s * s, s * s * s)).dot(edge[:, 1 : 1 + nx])
+        value, slope = self.nodes.costs[self.node]
+        S = value + s * slope
+        along = S.dot(tangent)
+        offset = along.dot(deviation) / (along.dot(tangent) + STILL * S.trace())
+        fastest = self.settings.fastest
+        return min(max(1.0 + pull * offset.item(), 1 / fastest), fastest)
 
-
-def _extended(phase: Phase, model: Model, trajectory: Trajectory, late: float) -> Phase:
-    """A phase that goes on beyond its impact, as the model would under its last torque."""
-    if late < LATE_KNOT:
-        return phase
-    planned = planning_model(model, trajectory.provenance.get('friction') == 'planned')
-    setup = Setup(stance=phase.stance)
-    compiled, p = compile_model(planned, setup), parameter_vector(planned, setup)
-    n = math.ceil(late / LATE_KNOT)
-    time, states, rates = [], [], []
-    x, u = phase.states[-1].copy(), np.array([phase.torque[-1]])
-    for k in range(1, n + 1):
-        compiled.advance(x, u, p, LATE_KNOT / 5, 5)
-        if np.abs(x[:2]).max() > 1.0:
-            break
-        time.append(phase.end + k * LATE_KNOT)
-        states.append(x.copy())
-        rates.append(np.asarray(compiled.f(x, u, p)).ravel())
-    n = len(time)
-    if n == 0:
-        return phase
-    return Phase(
-        phase.stance,
-        np.concatenate([phase.time, time]),
-        np.vstack([phase.states, states]),
-        np.vstack([phase.rates, rates]),
-        np.concatenate([phase.torque, np.full(n, phase.torque[-1])]),
-        np.vstack([phase.gains, np.tile(phase.gains[-1], (n, 1))]),
-        np.concatenate([phase.cost_to_go, np.tile(phase.cost_to_go[-1], (n, 1, 1))]),
-    )
+    def _blanked(self) -> bool:
+        if self.settings.remedy != 'blank':
+            return False
+        until, node = -self.elapsed, self.node
+        while until <= self.settings.window and not self._impact[node]:
+            until += self._span[node]
+            node = self._planned[node]
+            if node < 0:
+                return self._since_impact <= self.settings.window
+        return min(until, self._since_impact) <= self.settings.window
 
 
 def wrong_leg(trajectory: Trajectory, stance: str) -> str:

@@ -1,5 +1,8 @@
 """Planned motions against the exact hybrid model, and clear words where there is none."""
 
+import itertools
+import time
+
 import numpy as np
 import pytest
 
@@ -114,11 +117,22 @@ def test_impossible_tasks_are_infeasible_and_say_by_how_much(robot, task, messag
         optimise(robot, task)
 
 
-def test_being_out_of_time_is_not_infeasible(robot):
+def test_being_out_of_iterations_is_not_infeasible(robot):
     with pytest.raises(UndecidedError, match='there may be one'):
-        optimise(robot, REBALANCE, Options(seconds=0.0))
-    with pytest.raises(UndecidedError):
+        optimise(robot, REBALANCE, Options(iterations=0))
+    with pytest.raises(UndecidedError) as caught:
         optimise(robot, REBALANCE, Options(coarse_iterations=2))
+    # Four guesses of 2, 60 and 2 iterations at most.
+    assert 0 < caught.value.iterations <= 4 * 64
+
+
+def test_a_plan_depends_on_no_clock(robot, monkeypatch):
+    """A machine on which a second takes an hour makes the same plan, provenance included."""
+    task = Task(('inner', 'outer'), reach=0.2)
+    expected = optimise(robot, task).text()
+    clock = itertools.count(step=3600.0)
+    monkeypatch.setattr(time, 'perf_counter', lambda: next(clock))
+    assert optimise(robot, task).text() == expected
 
 
 @pytest.mark.parametrize(

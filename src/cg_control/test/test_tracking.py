@@ -7,6 +7,7 @@ import pytest
 
 from cg_control.collocation import Options
 from cg_control.planning import CheckOptions, RejectedError, check, executed, plan
+from cg_control.nodes import Nodes
 from cg_control.task import Task
 from cg_control.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import TrajectoryError
@@ -72,7 +73,7 @@ def test_friction_that_was_not_planned_is_compensated(robot):
 
 
 def test_event_goes_over_to_the_leg_that_stands(robot, step):
-    tracker = Tracker(step, robot, settings=TrackingSettings(remedy='event'))
+    tracker = Tracker(Nodes.of(step, robot), robot, TrackingSettings(remedy='event'))
     early = step.impact_times[0] - 0.05
     x = step.phases[0].at(early).state
     tracker.torque(0.0, 'inner', step.states[0])
@@ -80,14 +81,14 @@ def test_event_goes_over_to_the_leg_that_stands(robot, step):
     assert tracker.s == pytest.approx(early)
     tracker.torque(early + 0.002, 'outer', step.phases[1].states[0])
     assert tracker.s == step.phases[1].start
-    clock = Tracker(step, robot, settings=TrackingSettings(remedy='clock'))
+    clock = Tracker(Nodes.of(step, robot), robot, TrackingSettings(remedy='clock'))
     clock.torque(0.0, 'inner', step.states[0])
     clock.torque(early + 0.002, 'outer', step.phases[1].states[0])
     assert clock.s == pytest.approx(early + 0.002)
 
 
 def test_reference_goes_on_while_an_impact_is_late(robot, step):
-    tracker = Tracker(step, robot, settings=TrackingSettings(remedy='event'))
+    tracker = Tracker(Nodes.of(step, robot), robot, TrackingSettings(remedy='event'))
     end = step.phases[0].end
     tracker.torque(0.0, 'inner', step.states[0])
     tracker.torque(end + 0.05, 'inner', step.phases[0].states[-1])
@@ -95,7 +96,7 @@ def test_reference_goes_on_while_an_impact_is_late(robot, step):
 
 
 def test_phase_is_drawn_to_the_closest_point(robot, step):
-    tracker = Tracker(step, robot, settings=TrackingSettings(remedy='phase', pull=20.0))
+    tracker = Tracker(Nodes.of(step, robot), robot, TrackingSettings(remedy='phase', pull=20.0))
     tracker.torque(0.0, 'inner', step.states[0])
     # A robot that is 60 ms ahead of the clock.
     for k in range(1, 200):
@@ -105,11 +106,11 @@ def test_phase_is_drawn_to_the_closest_point(robot, step):
 
 
 def test_doubt_gives_no_torque(robot, step):
-    tracker = Tracker(step, robot)
+    tracker = Tracker(Nodes.of(step, robot), robot)
     assert tracker.torque(0.0, 'inner', np.array([0, np.nan, 0, 0])) == 0.0
     assert abs(tracker.torque(0.0, 'inner', np.array([9.0, 0, 0, 0]))) <= robot.torque_limit
     with pytest.raises(TrajectoryError, match='plan it again'):
-        Tracker(step, robot.with_values({'c1': 0.101}))
+        Nodes.of(step, robot.with_values({'c1': 0.101}))
     assert 'begins on the inner leg, but outer stands' in wrong_leg(step, 'outer')
     assert wrong_leg(step, 'inner') == ''
     with pytest.raises(ValueError, match='remedy'):

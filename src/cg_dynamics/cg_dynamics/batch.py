@@ -190,25 +190,48 @@ def batch_source(compiled: CompiledModel, width: int = WIDTH) -> str:
     """C source of the vector rollouts of a model."""
     e = compiled.equations
     f = ca.Function('f', [e.x, e.u, e.p], [ca.densify(ca.cse(e.rates))])
-    prepare, rates, shared = _vector_form(f)
+    rates, shared = vector_code(f, 'rates', 'prepare')
     here = Path(__file__).parent
     sizes = {
         'WIDTH': width, 'NX': compiled.nx, 'NU': compiled.nu, 'NP': max(compiled.np, 1),
         'SHARED': shared,
     }  # fmt: skip
-    return '\n'.join(
-        [
-            *(f'#define {name} {value}' for name, value in sizes.items()),
-            (here / 'vector_math.c').read_text(),
-            'static void prepare(const vd *p, vd *s)\n{',
-            *prepare,
-            '}\nstatic inline __attribute__((always_inline)) void rates(const vd *x, const vd *u,'
-            ' const vd *s, vd *dx)\n{',
-            *rates,
-            '}',
-            (here / 'batch.c').read_text(),
-        ]
-    )
+    return '\n'.join([
+        *(f'#define {name} {value}' for name, value in sizes.items()),
+        vector_math(),
+        rates,
+        (here / 'batch.c').read_text(),
+    ])  # fmt: skip
+
+
+def vector_math() -> str:
+    """C source of the elementary functions that vector code calls; WIDTH is defined before it."""
+    return (Path(__file__).parent / 'vector_math.c').read_text()
+
+
+def vector_code(f: ca.Function, name: str, prepare: str) -> tuple[str, int]:
+    """A function (x, u, p) -> y as two C functions on vectors.
+
+    Args:
+        f: The function; its result is dense.
+        name: Of name(x, u, s, dx), which fills dx with y.
+        prepare: Of prepare(p, s), which fills s with what depends on the parameters alone.
+
+    Returns:
+        The source, and how many values s holds.
+
+    Raises:
+        UnsupportedError: for an operation that has no vector form.
+    """
+    before, statements, shared = _vector_form(f)
+    return '\n'.join([
+        f'static void {prepare}(const vd *p, vd *s)\n{{',
+        *before,
+        f'}}\nstatic inline __attribute__((always_inline)) void {name}(const vd *x, const vd *u,'
+        ' const vd *s, vd *dx)\n{',
+        *statements,
+        '}',
+    ]), shared  # fmt: skip
 
 
 def _vector_form(f: ca.Function) -> tuple[list[str], list[str], int]:
@@ -311,4 +334,7 @@ def _one_by_one(compiled, time, u, x0, p, trajectories, feedback) -> np.ndarray:
     return states if trajectories else states[:, -1].copy()
 
 
-__all__ = ['Feedback', 'batch_library', 'batch_source', 'simulate_batch']
+__all__ = [
+    'FLAGS', 'WIDTH', 'Feedback', 'UnsupportedError', 'batch_library', 'batch_source',
+    'simulate_batch', 'vector_code', 'vector_math',
+]  # fmt: skip

@@ -271,8 +271,8 @@ class Walker:
         """A whole walk: see `walk`."""
         compiled = self.compiled[stance]
         # Torques on their way: (instant at which it acts, torque).
-        latches = [(instant, self._inputs(torque)) for instant, torque in torques]
-        u = self._inputs(0.0)
+        latches = [(instant, self.inputs(torque)) for instant, torque in torques]
+        u = self.inputs(0.0)
         while latches and latches[0][0] <= INSTANT:
             u = latches.pop(0)[1]
         if len(x) != compiled.nx:
@@ -282,7 +282,7 @@ class Walker:
         while t < duration - INSTANT and outcome == 'time':
             if self.command is not None:
                 wanted = self.command(t, leg.stance, x.copy())
-                latches.append((t + self.delay, self._inputs(wanted)))
+                latches.append((t + self.delay, self.inputs(wanted)))
             tick += 1
             end = min(tick * self.options.sample_time, duration)
             while t < end - INSTANT and outcome == 'time':
@@ -330,7 +330,8 @@ class Walker:
             leg.forget()
         return leg, x
 
-    def _inputs(self, torque) -> np.ndarray:
+    def inputs(self, torque) -> np.ndarray:
+        """The inputs (nu,) for a torque in N m: what effects ask for besides is on."""
         extra = self.compiled['inner'].nu - 1
         return np.concatenate([np.array(torque, float).reshape(1), np.ones(extra)])
 

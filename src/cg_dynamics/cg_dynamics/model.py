@@ -1,9 +1,12 @@
 """A model: mechanism, effects and their numbers. The one thing that all other packages load."""
 
+import functools
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from cg_description.model_file import (
@@ -29,6 +32,9 @@ from cg_dynamics.parameter import Parameter
 class Model:
     """A robot as numbers and physics. Immutable: every change returns a new model.
 
+    Mappings are copied when a model is made and cannot be written to, so what is computed from
+    them once stays true.
+
     Attributes:
         name: Name of the robot.
         mechanism: Its rigid bodies.
@@ -50,6 +56,27 @@ class Model:
     actuators: Mapping[str, Mapping[str, Quantity]]
     description: str
     provenance: Mapping[str, Any]
+
+    def __post_init__(self):
+        provenance = self.provenance
+        if not isinstance(provenance, MappingProxyType):
+            provenance = MappingProxyType(deepcopy(dict(provenance)))
+        read_only = {
+            'quantities': MappingProxyType(dict(self.quantities)),
+            'sensors': _entries_read_only(self.sensors),
+            'actuators': _entries_read_only(self.actuators),
+            'provenance': provenance,
+        }
+        for name, mapping in read_only.items():
+            object.__setattr__(self, name, mapping)
+
+    def __reduce__(self):
+        # Read-only mappings do not travel between processes; __post_init__ makes them again.
+        content = self.to_file()
+        return Model, (
+            self.name, self.mechanism, self.effects, dict(self.quantities), content.sensors,
+            content.actuators, self.description, content.provenance,
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: str | Path) -> 'Model':
@@ -139,7 +166,7 @@ class Model:
         """Write the model file, whole or not at all."""
         write_atomically(path, self.text())
 
-    @property
+    @functools.cached_property
     def hash(self) -> str:
         """SHA-256 of the text: the name by which bags and trajectories know this model."""
         return sha256(self.text())
@@ -231,6 +258,10 @@ def _effect(entry: EffectEntry, body: Mechanism, place: str) -> Effect:
     except ModelError as error:
         hint = '' if entry.name in LIBRARY else meant(entry.name, LIBRARY)
         raise ModelError(f'{place}: {error}{hint}') from None
+
+
+def _entries_read_only(channels):
+    return MappingProxyType({c: MappingProxyType(dict(q)) for c, q in channels.items()})
 
 
 def _match(

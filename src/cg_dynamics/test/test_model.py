@@ -1,9 +1,14 @@
 """Models: round trip through the file, and one clear error for each thing that can be wrong."""
 
+import pickle
+from copy import deepcopy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 
+from cg_description.model_file import sha256
 from cg_dynamics.assemble import parameter_names, parameter_vector
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms import MECHANISMS
@@ -42,6 +47,30 @@ def test_every_effect_survives_the_file(robot, name):
     again = Model.from_text(model.text())
     assert [e.label for e in again.effects] == [e.label for e in model.effects]
     assert again.values == model.values
+
+
+def test_what_a_model_is_made_of_cannot_be_written_to(robot):
+    """The hash is computed once: nothing that it stands for may change behind its back."""
+    quantities, entries = dict(robot.quantities), {'links': {'a': 1}}
+    model = replace(robot, quantities=quantities, provenance=entries)
+    before = model.hash
+    quantities['c1'] = replace(quantities['c1'], value=0.5)
+    entries['links']['a'] = 2
+    assert model.hash == before == sha256(model.text())
+    for mapping in (model.quantities, model.sensors, model.actuators, model.provenance):
+        with pytest.raises(TypeError):
+            mapping['c1'] = None
+    with pytest.raises(TypeError):
+        next(iter(model.actuators.values()))['limit'] = None
+    assert model.with_values({'c1': 0.11}).hash != before
+
+
+def test_model_travels_between_processes(robot):
+    robot.hash  # noqa: B018  what was computed must not stay behind as something else
+    there = pickle.loads(pickle.dumps(robot))
+    assert there.quantities == robot.quantities
+    assert there.hash == sha256(there.text()) == robot.hash
+    assert deepcopy(robot).text() == robot.text()
 
 
 def test_file_is_saved_whole(robot, tmp_path):

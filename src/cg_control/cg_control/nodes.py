@@ -1,0 +1,354 @@
+"""Trajectories as nodes in flat arrays: a tree that a robot can follow from anywhere.
+
+A node is a knot of a trajectory. From node i the reference moves to `next[i]` within `span[i]`
+seconds, on the same leg; when the foot lands it jumps to `landing[i]`, which is where the next
+impact ahead leads. Between two nodes the state is the cubic of trajectory.py, torque, gain and
+cost to go are linear. A trajectory that ends on another one is grafted there, by a link: a node
+whose span is zero. Every way ends at a root, where the reference rests and the gain is that of
+the balance controller. What the reference does while an impact is late are nodes too, but no
+state is claimed by them.
+
+    x0 ----> x1 ----> x2 (impact) - - > late - - > late, rests      next, on the first leg
+     \________\________\___________________/
+                  landing: x3 ----> x4 -link-> root, rests          on the other leg
+"""
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cg_control.collocation import planning_model
+from cg_control.trajectory import Phase, Trajectory, TrajectoryError
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import compile_model
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES, Setup
+
+LATE = 0.3  # s for which the reference goes on while an impact is late
+LATE_KNOT = 0.01  # s between its knots
+FALLING = 1.0  # rad at which it ends
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """A tree of trajectories. Growing it returns a new one in which old nodes keep their index.
+
+    Attributes:
+        stance: Leg that stands, index into STANCES, shape (n,).
+        x0: Nominal states, (q_inner, q_outer) and rates, shape (n, nx).
+        rates: dx0/dt, shape (n, nx).
+        u0: Nominal torque in N m, shape (n,).
+        K: Gains of u = u0 - K (x - x0), shape (n, nx).
+        S: Cost to go of a deviation, shape (n, nx, nx).
+        span: Time to `next` in s; 0 is a link, infinite is rest: shape (n,).
+        next: Successor in time on the same leg, -1 at rest, shape (n,).
+        landing: Where the reference goes when the foot lands, -1 where no impact is ahead: (n,).
+        late: Whether the node lies beyond a late impact, shape (n,).
+        time: Instant on the clock of its trajectory in s, shape (n,).
+        branch: Number of the trajectory that brought it, 0 is a root, shape (n,).
+        rho: Level of the funnel, x claimed by a node if (x - x0)' S (x - x0) <= rho: infinite
+            until cut, 0 where nothing is claimed. Shape (n,); the one array that may be written.
+        model_hash: Of the model that all trajectories are planned for.
+        compensate: The controller adds the friction that the trajectories were planned without.
+    """
+
+    stance: np.ndarray
+    x0: np.ndarray
+    rates: np.ndarray
+    u0: np.ndarray
+    K: np.ndarray
+    S: np.ndarray
+    span: np.ndarray
+    next: np.ndarray
+    landing: np.ndarray
+    late: np.ndarray
+    time: np.ndarray
+    branch: np.ndarray
+    rho: np.ndarray
+    model_hash: str
+    compensate: bool = False
+
+    @classmethod
+    def root(
+        cls,
+        stance: str,
+        gain: np.ndarray,
+        cost_to_go: np.ndarray,
+        model_hash: str,
+        compensate: bool = False,
+        rho: float = math.inf,
+    ) -> 'Nodes':
+        """A tree of one node: the equilibrium at zero on one leg, held by its balance controller.
+
+        Args:
+            stance: The leg.
+            gain: K of u = -K x, shape (nx,).
+            cost_to_go: S there, shape (nx, nx).
+            model_hash: Of the model.
+            compensate: As the attribute.
+            rho: Level of the funnel.
+        """
+        K = np.array(gain, float).ravel()
+        nx = len(K)
+        S = np.array(cost_to_go, float)
+        if S.shape != (nx, nx):
+            raise ValueError(f'cost_to_go has shape {S.shape}, the gain has {nx} entries')
+        whole, zero = np.zeros(1, np.int32), np.zeros(1)
+        return cls(
+            whole + STANCES.index(stance), np.zeros((1, nx)), np.zeros((1, nx)), zero, K[None],
+            S[None], zero + math.inf, whole - 1, whole - 1, np.zeros(1, bool), zero.copy(), whole,
+            zero + rho, model_hash, compensate,
+        )  # fmt: skip
+
+    @classmethod
+    def of(
+        cls,
+        trajectory: Trajectory,
+        model: Model,
+        balance: np.ndarray | None = None,
+        late: float = LATE,
+    ) -> 'Nodes':
+        """One trajectory that ends in balance; its first node is `first`.
+
+        Args:
+            trajectory: With gains.
+            model: The robot that it was planned for.
+            balance: Gain on the last leg after the end, shape (nx,); None takes the last gain.
+            late: As in `grafted`.
+        """
+        last = trajectory.phases[-1]
+        gain = last.gains[-1] if balance is None else balance
+        compensate = trajectory.provenance.get('friction') == 'to be compensated'
+        root = cls.root(
+            last.stance, gain, last.cost_to_go[-1], trajectory.model_hash, compensate
+        )
+        return root.grafted(trajectory, model, 0, late=late)
+
+    def __len__(self) -> int:
+        return len(self.stance)
+
+    @property
+    def first(self) -> int:
+        """First node of the trajectory that was grafted last."""
+        return int(np.argmax(self.branch == self.branch.max()))
+
+    def grafted(
+        self,
+        trajectory: Trajectory,
+        model: Model,
+        onto: int,
+        elapsed: float = 0.0,
+        late: float = LATE,
+    ) -> 'Nodes':
+        """This tree and a trajectory that ends on it.
+
+        Args:
+            trajectory: With gains, whose cost to go at the end is that of the tree there.
+            model: The robot: the motion beyond a late impact is its own.
+            onto: Node at which it ends.
+            elapsed: Or so much later, at most that node's span, s: between two nodes the tree
+                gets one more.
+            late: How long the reference goes on while an impact is late, s.
+
+        Raises:
+            TrajectoryError: for another model, another leg or another way to treat friction.
+        """
+        trajectory.require_model(model)
+        if trajectory.model_hash != self.model_hash:
+            raise TrajectoryError('trajectory and tree were planned for different models')
+        if not 0 <= onto < len(self):
+            raise TrajectoryError(f'node is {onto}; the tree has nodes 0 to {len(self) - 1}')
+        leg = STANCES[self.stance[onto]]
+        if trajectory.modes[-1] != leg:
+            raise TrajectoryError(
+                f'the trajectory ends on the {trajectory.modes[-1]} leg, node {onto} stands on '
+                f'the {leg} leg'
+            )
+        if (trajectory.provenance.get('friction') == 'to be compensated') != self.compensate:
+            raise TrajectoryError(
+                'friction is planned in one of trajectory and tree, and compensated in the other'
+            )
+        tree, place = self._opened(onto, elapsed)
+        number = int(tree.branch.max()) + 1
+        last = len(trajectory.phases) - 1
+        blocks = [
+            _block(phase, number, self, *_beyond(phase, model, self, late if i < last else 0.0))
+            for i, phase in enumerate(trajectory.phases)
+        ]
+        starts = np.cumsum([len(tree), *map(len, blocks)])
+        for i, block in enumerate(blocks):
+            block.next[:-1] += starts[i]
+            block.landing[:] = starts[i + 1] if i < last else tree.landing[place]
+        blocks[last].next[-1], blocks[last].span[-1] = place, 0.0
+        return _concatenated([tree, *blocks])
+
+    def joined(self, other: 'Nodes') -> 'Nodes':
+        """Both trees, the nodes of the other one behind those of this one."""
+        if (self.model_hash, self.compensate) != (other.model_hash, other.compensate):
+            raise TrajectoryError('trees of different models, or of different ways with friction')
+        n = len(self)
+        moved = replace(
+            other,
+            next=np.where(other.next < 0, -1, other.next + n).astype(np.int32),
+            landing=np.where(other.landing < 0, -1, other.landing + n).astype(np.int32),
+            branch=np.where(
+                other.branch == 0, 0, other.branch + self.branch.max()
+            ).astype(np.int32),
+        )
+        return _concatenated([self, moved])
+
+    @property
+    def impact(self) -> np.ndarray:
+        """Whether an impact is planned at a node, shape (n,)."""
+        ends = (self.next < 0) | self.late[self.next]
+        return (self.landing >= 0) & ends & ~self.late
+
+    @property
+    def planned(self) -> np.ndarray:
+        """Successor along the plan: `landing` where an impact is planned, -1 at a root: (n,)."""
+        return np.where(self.impact | self.late, self.landing, self.next)
+
+    @functools.cached_property
+    def to_go(self) -> np.ndarray:
+        """Nominal time to the root in s, shape (n,); NaN if the way leads round for ever."""
+        return self._along(np.where(self.impact | self.late, 0.0, self.span))
+
+    @functools.cached_property
+    def steps(self) -> np.ndarray:
+        """Impacts that are planned between a node and its root, shape (n,); NaN as `to_go`."""
+        return self._along((self.impact | self.late).astype(float))
+
+    def _along(self, step: np.ndarray) -> np.ndarray:
+        """Sum of what each node of the plan adds, from there to the root."""
+        planned = self.planned
+        ends = planned < 0
+        total, at = np.where(ends, 0.0, step), np.where(ends, np.arange(len(self)), planned)
+        # Each round looks twice as far ahead.
+        for _ in range(len(self).bit_length()):
+            total, at = total + total[at], at[at]
+        return np.where(ends[at], total, math.nan)
+
+    @functools.cached_property
+    def edges(self) -> np.ndarray:
+        """(u0, x0, K) on the way to `next`, as powers of the time since: (n, 4, 1 + 2 nx)."""
+        nx, h = self.x0.shape[1], self.span[:, None]
+        moves = np.isfinite(self.span) & (self.span > 0)
+        then = np.where(moves, self.next, 0)
+        h = np.where(moves[:, None], h, 1.0)
+        found = np.zeros((len(self), 4, 1 + 2 * nx))
+        linear = np.column_stack([self.u0, self.K])
+        columns = [0, *range(1 + nx, 1 + 2 * nx)]
+        found[:, 0, columns] = linear
+        found[:, 1, columns] = (linear[then] - linear) / h
+        rise, d0, d1 = (self.x0[then] - self.x0) / h, self.rates, self.rates[then]
+        states = slice(1, 1 + nx)
+        found[:, 0, states] = self.x0
+        found[:, 1, states] = d0
+        found[:, 2, states] = (3 * rise - 2 * d0 - d1) / h
+        found[:, 3, states] = (d0 + d1 - 2 * rise) / h**2
+        found[~moves, 1:] = 0.0
+        return found
+
+    @functools.cached_property
+    def costs(self) -> np.ndarray:
+        """S on the way to `next`: its value and what it grows by in a second: (n, 2, nx, nx)."""
+        moves = np.isfinite(self.span) & (self.span > 0)
+        then = np.where(moves, self.next, 0)
+        h = np.where(moves, self.span, 1.0)[:, None, None]
+        slope = np.where(moves[:, None, None], (self.S[then] - self.S) / h, 0.0)
+        return np.stack([self.S, slope], axis=1)
+
+    def cost_to_go(self, node: int, elapsed: float, x: np.ndarray) -> float:
+        """(x - x0)' S (x - x0) at a point of the tree, for a state (nx,)."""
+        nx = self.x0.shape[1]
+        reference = elapsed ** np.arange(4.0) @ self.edges[node]
+        S = self.costs[node, 0] + elapsed * self.costs[node, 1]
+        deviation = x - reference[1 : 1 + nx]
+        return float(deviation @ S @ deviation)
+
+    def _opened(self, onto: int, elapsed: float) -> tuple['Nodes', int]:
+        """The tree with a node at a point, and that node's index."""
+        span = float(self.span[onto])
+        if not 0.0 <= elapsed <= span:
+            raise TrajectoryError(f'elapsed is {elapsed} s; node {onto} spans 0 to {span} s')
+        if elapsed == 0.0 or math.isinf(span):
+            return self, onto
+        if self.late[onto] or self.impact[onto]:
+            raise TrajectoryError(f'what follows node {onto} is the reference of a late impact')
+        if elapsed == span:
+            return self, int(self.next[onto])
+        nx = self.x0.shape[1]
+        powers = elapsed ** np.arange(4.0)
+        slopes = np.array([0.0, 1.0, 2 * elapsed, 3 * elapsed**2])
+        u0, x0, K = np.split(powers @ self.edges[onto], [1, 1 + nx])
+        one = self._rows(np.array([onto]))
+        point = replace(
+            one, x0=x0[None], u0=u0, K=K[None],
+            rates=(slopes @ self.edges[onto])[None, 1 : 1 + nx],
+            S=(self.costs[onto, 0] + elapsed * self.costs[onto, 1])[None],
+            span=one.span - elapsed, time=one.time + elapsed, rho=np.full(1, math.inf),
+        )  # fmt: skip
+        return _concatenated([self, point]), len(self)
+
+    def _rows(self, rows: np.ndarray) -> 'Nodes':
+        return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
+
+
+ARRAYS = (
+    'stance', 'x0', 'rates', 'u0', 'K', 'S', 'span', 'next', 'landing', 'late', 'time', 'branch',
+    'rho',
+)  # fmt: skip
+
+
+def _concatenated(parts: list[Nodes]) -> Nodes:
+    return replace(
+        parts[0],
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS},
+    )
+
+
+def _block(
+    phase: Phase, number: int, tree: Nodes, time: np.ndarray, states: np.ndarray, rates: np.ndarray
+) -> Nodes:
+    """The nodes of a phase and of what follows while its impact is late; `next` is from 0 on."""
+    m, n = len(phase.time), len(phase.time) + len(time)
+    instants = np.concatenate([phase.time, time])
+    late = np.arange(n) >= m
+    held = np.minimum(np.arange(n), m - 1)
+    return replace(
+        tree,
+        stance=np.full(n, STANCES.index(phase.stance), np.int32),
+        x0=np.vstack([phase.states, states]),
+        rates=np.vstack([phase.rates, rates]),
+        u0=phase.torque[held],
+        K=phase.gains[held],
+        S=phase.cost_to_go[held],
+        span=np.append(np.diff(instants), math.inf),
+        next=np.append(np.arange(1, n), -1).astype(np.int32),
+        landing=np.full(n, -1, np.int32),
+        late=late,
+        time=instants,
+        branch=np.full(n, number, np.int32),
+        rho=np.where(late, 0.0, math.inf),
+    )
+
+
+def _beyond(
+    phase: Phase, model: Model, tree: Nodes, late: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Instants, states and rates after a phase, as the model moves on under its last torque."""
+    nx = phase.states.shape[1]
+    time, states, rates = [], [np.zeros((0, nx))], [np.zeros((0, nx))]
+    planned, setup = planning_model(model, not tree.compensate), Setup(stance=phase.stance)
+    compiled, p = compile_model(planned, setup), parameter_vector(planned, setup)
+    x, u = phase.states[-1].copy(), np.array([phase.torque[-1]])
+    for k in range(1, math.ceil(late / LATE_KNOT) + 1):
+        compiled.advance(x, u, p, LATE_KNOT / 5, 5)
+        if np.abs(x[:2]).max() > FALLING:
+            break
+        time.append(phase.end + k * LATE_KNOT)
+        states.append(x.copy()[None])
+        rates.append(np.asarray(compiled.f(x, u, p)).T)
+    return np.array(time), np.vstack(states), np.vstack(rates)
