@@ -59,21 +59,23 @@ class TrajectoryController:
             return CAUGHT if self._tracker.done else TRACKING
         return FALLEN if self._fallen else self.balance.mode
 
-    def start(self, trajectory: Trajectory) -> str:
+    def start(self, trajectory: Trajectory, at: float = 0.0) -> str:
         """Begin a trajectory at the next step; says why it cannot, or nothing.
 
         Args:
             trajectory: With gains; of this model.
+            at: Time into it at which to begin, s.
         """
         if self._state is None:
             return 'no state yet'
         if self._fallen or self.mode not in (BALANCING, CAUGHT):
             return f'the robot is {self.mode}, not balancing'
         stance, x = self._state
-        problem = wrong_leg(trajectory, stance)
+        begin = trajectory.phases[0].start + at
+        problem = wrong_leg(trajectory, stance, begin)
         if problem:
             return problem
-        away = np.abs(x - trajectory.states[0]) * [1, 1, 0.1, 0.1]
+        away = np.abs(x - trajectory.at(begin).state) * [1, 1, 0.1, 0.1]
         if away.max() > self.settings.start_tolerance:
             return (
                 f'the robot is {away.max():.3g} rad from the start of the trajectory, allowed '
@@ -83,9 +85,11 @@ class TrajectoryController:
         try:
             gain = self.balance.gains[last][:4]
             nodes = Nodes.of(trajectory, self.model, gain, self.settings.late)
-            self._tracker = Tracker(nodes, self.model, self.settings)
+            tracker = Tracker(nodes, self.model, self.settings)
+            tracker.begin(*nodes.locate(begin))
         except ValueError as error:
             return str(error)
+        self._tracker = tracker
         return ''
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""Trajectories as nodes in flat arrays: a tree that a robot can follow from anywhere.
+r"""Trajectories as nodes in flat arrays: a tree that a robot can follow from anywhere.
 
 A node is a knot of a trajectory. From node i the reference moves to `next[i]` within `span[i]`
 seconds, on the same leg; when the foot lands it jumps to `landing[i]`, which is where the next
@@ -16,6 +16,7 @@ state is claimed by them.
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,9 @@ class Nodes:
         time: Instant on the clock of its trajectory in s, shape (n,).
         branch: Number of the trajectory that brought it, 0 is a root, shape (n,).
         rho: Level of the funnel, x claimed by a node if (x - x0)' S (x - x0) <= rho: infinite
-            until cut, 0 where nothing is claimed. Shape (n,); the one array that may be written.
+            until cut. 0, which claims nothing, beyond a late impact and at a planned one: there
+            the foot is on the ground, and it depends on rounding whether it has landed. Shape
+            (n,); the one array that may be written.
         model_hash: Of the model that all trajectories are planned for.
         compensate: The controller adds the friction that the trajectories were planned without.
     """
@@ -134,6 +137,17 @@ class Nodes:
         """First node of the trajectory that was grafted last."""
         return int(np.argmax(self.branch == self.branch.max()))
 
+    def locate(self, s: float) -> tuple[int, float]:
+        """Node and time since for an instant on the clock of the last trajectory, s."""
+        mine = np.flatnonzero((self.branch == self.branch.max()) & ~self.late)
+        if not self.time[mine[0]] <= s <= self.time[mine[-1]]:
+            raise ValueError(
+                f's is {s} s; the trajectory goes from {self.time[mine[0]]} to '
+                f'{self.time[mine[-1]]} s'
+            )
+        node = int(mine[np.searchsorted(self.time[mine], s, side='right') - 1])
+        return node, s - float(self.time[node])
+
     def grafted(
         self,
         trajectory: Trajectory,
@@ -181,6 +195,8 @@ class Nodes:
         for i, block in enumerate(blocks):
             block.next[:-1] += starts[i]
             block.landing[:] = starts[i + 1] if i < last else tree.landing[place]
+            if i < last:
+                block.rho[len(trajectory.phases[i].time) - 1] = 0.0
         blocks[last].next[-1], blocks[last].span[-1] = place, 0.0
         return _concatenated([tree, *blocks])
 
@@ -260,6 +276,11 @@ class Nodes:
         slope = np.where(moves[:, None, None], (self.S[then] - self.S) / h, 0.0)
         return np.stack([self.S, slope], axis=1)
 
+    @functools.cached_property
+    def forms(self) -> np.ndarray:
+        """`costs` as coefficients of x_i x_j, i <= j, row by row: (n, 2, nx (nx + 1) / 2)."""
+        return triangles(self.costs)
+
     def cost_to_go(self, node: int, elapsed: float, x: np.ndarray) -> float:
         """(x - x0)' S (x - x0) at a point of the tree, for a state (nx,)."""
         nx = self.x0.shape[1]
@@ -302,11 +323,17 @@ ARRAYS = (
 )  # fmt: skip
 
 
+def triangles(forms: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (..., n, n) as coefficients of x_i x_j, i <= j: (..., n (n + 1) / 2)."""
+    i, j = np.triu_indices(forms.shape[-1])
+    return np.ascontiguousarray(forms[..., i, j] * np.where(i == j, 1.0, 2.0))
+
+
 def _concatenated(parts: list[Nodes]) -> Nodes:
-    return replace(
-        parts[0],
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS},
-    )
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS
+    }
+    return replace(parts[0], **arrays)
 
 
 def _block(

@@ -17,7 +17,8 @@
 #define LAW (1 + 2 * NL)
 #define FORM (NL * (NL + 1) / 2)
 #define INSTANT 1e-12
-#define NEWTON 8
+#define NEWTON 60
+#define CONVERGED 1e-13
 #define LIMIT_OF_STATES 1e6
 #define STILL 1e-3
 
@@ -26,7 +27,8 @@ enum { RUNNING, ARRIVED, FALLEN, LEFT, TIMED_OUT };
 struct job {
     /* The tree: leg, next, landing, late, span (n), edge (n, 4, LAW), cost (n, 2, FORM); what
        the controller knows, (NK). */
-    const int *leg, *next, *landing, *late;
+    const int *leg, *next, *landing;
+    const unsigned char *late;
     const double *span, *edge, *cost, *known;
     /* Goal forms (2, FORM) or null; parameters (NP), or (B, NP) if p_each. */
     const double *goal, *p;
@@ -46,10 +48,11 @@ struct job {
     long p_each, visits, length_at;
 };
 
-/* A rollout while it is in no lane; and what of it is no vector while it is in one. */
+/* A rollout while it is in no lane; node and visits also while it is in one. It has begun `tick`
+   samples, and `left` steps of h are left of the last one. */
 struct walk {
-    double x[NX], torque, h, elapsed;
-    int node, tick, left, visits, fresh;
+    double x[NX], torque, h, elapsed, left, tick;
+    int node, visits;
 };
 
 /* Rollouts of one leg that wait for a lane. */
@@ -59,10 +62,29 @@ struct queue {
 };
 
 struct lanes {
-    vd x[NX], u[NU], h, elapsed, span, edge[4][LAW], form[2][FORM], c[CONSTANTS];
+    vd x[NX], u[NU], h, elapsed, left, tick, samples, span, edge[4][LAW], form[2][FORM];
+    vd c[CONSTANTS], landing[CONSTANTS], length;
+    vi busy, strange;   /* strange: at the start, or on a leg that is not the node's */
     long number[WIDTH]; /* -1: idle */
     struct walk *walk[WIDTH];
 };
+
+static inline int any(vi mask)
+{
+#if WIDTH == 8
+    /* Halves: a loop over the lanes costs as much as a twentieth of a step. */
+    typedef long long v4 __attribute__((vector_size(32)));
+    typedef long long v2 __attribute__((vector_size(16)));
+    union { vi all; v4 half[2]; } eight = {mask};
+    union { v4 all; v2 half[2]; } four = {eight.half[0] | eight.half[1]};
+    v2 two = four.half[0] | four.half[1];
+    return (two[0] | two[1]) != 0;
+#else
+    long long found = 0;
+    for (int j = 0; j < WIDTH; j++) found |= mask[j];
+    return found != 0;
+#endif
+}
 
 static double form_of(const double *value, const double *slope, double s, const double *d)
 {
@@ -80,8 +102,9 @@ static void enter(const struct job *job, struct lanes *l, int j)
     const double *cost = job->cost + (long)node * 2 * FORM;
     for (int k = 0; k < 4; k++)
         for (int i = 0; i < LAW; i++) l->edge[k][i][j] = edge[k * LAW + i];
-    for (int k = 0; k < 2; k++)
-        for (int i = 0; i < FORM; i++) l->form[k][i][j] = cost[k * FORM + i];
+    if (job->pull > 0)
+        for (int k = 0; k < 2; k++)
+            for (int i = 0; i < FORM; i++) l->form[k][i][j] = cost[k * FORM + i];
 }
 
 /* Move a lane's reference on to the node it is at; note the nodes that are passed. */
@@ -91,7 +114,7 @@ static void advance(const struct job *job, struct lanes *l, int j, int st)
     int passed[32], count = 0, node = w->node;
     double s = l->elapsed[j];
     if (job->leg[node] != st) node = job->landing[node], s = 0.0, passed[count++] = node;
-    else if (w->fresh) passed[count++] = node;
+    else if (l->tick[j] == 0.0) passed[count++] = node;
     while (s >= job->span[node]) {
         s -= job->span[node], node = job->next[node];
         if (count < 32 && !job->late[node]) passed[count++] = node;
@@ -137,15 +160,20 @@ static vd phase_rate(const struct job *job, const struct lanes *l)
     return v_fmin(v_fmax(rate, SPLAT(1.0 / job->fastest)), SPLAT(job->fastest));
 }
 
+static void empty(struct lanes *l, int j)
+{
+    for (int i = 0; i < NX; i++) l->x[i][j] = 0.0;
+    l->number[j] = -1, l->busy[j] = 0, l->h[j] = 0.0, l->left[j] = INFINITY;
+}
+
 static void finish(const struct job *job, struct lanes *l, int j, int st, int outcome)
 {
-    struct walk *w = l->walk[j];
     long b = l->number[j];
-    for (int i = 0; i < NX; i++) job->x[b * NX + i] = l->x[i][j], l->x[i][j] = 0.0;
-    job->elapsed[b] = l->elapsed[j];
-    job->node[b] = w->node, job->stance[b] = st, job->outcome[b] = outcome;
-    job->time[b] = w->tick * job->sample_time - w->left * l->h[j];
-    l->h[j] = 0.0, l->number[j] = -1, w->left = 0;
+    for (int i = 0; i < NX; i++) job->x[b * NX + i] = l->x[i][j];
+    job->elapsed[b] = l->elapsed[j], job->node[b] = l->walk[j]->node;
+    job->stance[b] = st, job->outcome[b] = outcome;
+    job->time[b] = l->tick[j] * job->sample_time;
+    empty(l, j);
 }
 
 static void park(struct lanes *l, int j, struct queue *q)
@@ -153,9 +181,19 @@ static void park(struct lanes *l, int j, struct queue *q)
     struct walk *w = l->walk[j];
     for (int i = 0; i < NX; i++) w->x[i] = l->x[i][j];
     w->torque = l->u[0][j], w->h = l->h[j], w->elapsed = l->elapsed[j];
+    w->left = l->left[j], w->tick = l->tick[j];
     q->number[q->size++] = l->number[j];
-    l->h[j] = 0.0, l->number[j] = -1;
-    for (int i = 0; i < NX; i++) l->x[i][j] = 0.0;
+    empty(l, j);
+}
+
+static void load(const struct job *job, struct lanes *l, int j, int st, struct walk *w, long b)
+{
+    l->number[j] = b, l->walk[j] = w, l->busy[j] = -1;
+    for (int i = 0; i < NX; i++) l->x[i][j] = w->x[i];
+    l->u[0][j] = w->torque, l->h[j] = w->h, l->elapsed[j] = w->elapsed;
+    l->left[j] = w->left, l->tick[j] = w->tick, l->samples[j] = job->samples[b];
+    l->strange[j] = w->tick == 0.0 || job->leg[w->node] != st ? -1 : 0;
+    enter(job, l, j);
 }
 
 static inline __attribute__((always_inline)) void prepare(int st, const vd *p, vd *c)
@@ -202,47 +240,48 @@ static void parameters_of(const struct job *job, const struct lanes *l, vd *p)
    stance leg's angle and b the swing leg's: its sign is that of (b - a)(a + b - 2 slope). */
 static inline vd sum_of(const struct job *job, vd a, vd b) { return a + b - 2.0 * job->slope; }
 
-/* Land the lanes that came down between x (before) and y (after a step of l->h); sets `moved`. */
+/* Land the lanes that came down between l->x and `after`, a step of l->h later. */
 static inline __attribute__((always_inline)) void land(const struct job *job, struct lanes *l,
-                                                       int st, const vd *before, vi down,
+                                                       int st, const vd *after, vi down,
                                                        struct queue *other)
 {
     const int sw = 1 - st;
-    vd low = SPLAT(0.0), high = l->h, y[NX], v[2], p[NP], c[CONSTANTS];
-    vd from = sum_of(job, before[st], before[sw]);
-    vd to = sum_of(job, l->x[st], l->x[sw]);
+    vd low = SPLAT(0.0), high = l->h, y[NX], v[2];
+    vd from = sum_of(job, l->x[st], l->x[sw]), to = sum_of(job, after[st], after[sw]);
     vd part = l->h * from / (from - to);
-    for (int k = 0; k < NEWTON; k++) {
+    /* A lane stops where it has converged by itself: its result must not depend on the others. */
+    vi open = down;
+    for (int k = 0; k < NEWTON && any(open); k++) {
         part = v_select(down, part, SPLAT(0.0));
-        for (int i = 0; i < NX; i++) y[i] = before[i];
+        for (int i = 0; i < NX; i++) y[i] = l->x[i];
         runge_kutta(st, y, l->u, l->c, part);
         vd value = sum_of(job, y[st], y[sw]);
         vi same = (value > 0.0) == (from > 0.0);
         low = v_select(same, part, low), high = v_select(same, high, part);
         vd newton = part - value / (y[NL / 2] + y[NL / 2 + 1]);
         vi inside = (newton >= low) & (newton <= high);
-        part = v_select(inside, newton, 0.5 * (low + high));
+        newton = v_select(inside, newton, 0.5 * (low + high));
+        vd change = v_fabs(newton - part);
+        part = v_select(open, newton, part);
+        open &= change > CONVERGED;
     }
     part = v_select(down, part, SPLAT(0.0));
-    for (int i = 0; i < NX; i++) y[i] = before[i];
+    for (int i = 0; i < NX; i++) y[i] = l->x[i];
     runge_kutta(st, y, l->u, l->c, part);
-    parameters_of(job, l, p);
-    if (st) prepare_land_1(p, c), land_1(y, l->u, c, v);
-    else prepare_land_0(p, c), land_0(y, l->u, c, v);
+    if (st) land_1(y, l->u, l->landing, v);
+    else land_0(y, l->u, l->landing, v);
     vd reach = v_sin(y[st]) - v_sin(y[sw]);
     for (int j = 0; j < WIDTH; j++) {
         /* What is no step: legs that pass each other, a foot too near. */
-        double length = p[job->length_at][j];
+        double length = l->length[j];
         if (!down[j] || !(job->ahead * length * reach[j] > job->minimum_step)) continue;
-        struct walk *w = l->walk[j];
         for (int i = 0; i < NX; i++) l->x[i][j] = y[i][j];
         /* left was counted down already. */
-        double rest = (w->left + 1) * l->h[j] - part[j];
+        double rest = (l->left[j] + 1.0) * l->h[j] - part[j];
         l->x[NL / 2][j] = v[0][j], l->x[NL / 2 + 1][j] = v[1][j];
         job->impacts[l->number[j]]++;
-        w->left = rest > INSTANT ? (int)ceil(rest / job->step - 1e-9) : 0;
-        if (rest > INSTANT && w->left < 1) w->left = 1;
-        l->h[j] = w->left ? rest / w->left : 0.0;
+        l->left[j] = rest > INSTANT ? fmax(1.0, ceil(rest / job->step - 1e-9)) : 0.0;
+        l->h[j] = l->left[j] > 0.0 ? rest / l->left[j] : 0.0;
         park(l, j, other);
     }
 }
@@ -254,84 +293,76 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
                                                       struct queue *own, struct queue *other)
 {
     struct lanes l = {0};
-    struct walk nobody = {0};
-    const double T = job->sample_time;
-    const int steps = (int)ceil(T / job->step - 1e-9) < 1 ? 1 : (int)ceil(T / job->step - 1e-9);
+    const double T = job->sample_time, steps = fmax(1.0, ceil(T / job->step - 1e-9));
 #if COMPENSATE
     vd known[NK], friction[CONSTANTS];
     for (int i = 0; i < NK; i++) known[i] = SPLAT(job->known[i]);
     prepare_taken(known, friction);
 #endif
-    for (int i = 0; i < NU; i++) l.u[i] = SPLAT(1.0);
-    l.u[0] = SPLAT(0.0), l.span = SPLAT(INFINITY);
-    for (int j = 0; j < WIDTH; j++) l.number[j] = -1, l.walk[j] = &nobody;
+    for (int i = 1; i < NU; i++) l.u[i] = SPLAT(1.0);
+    for (int j = 0; j < WIDTH; j++) empty(&l, j);
     for (int prepared = 0;;) {
-        int active = 0, loaded = 0;
-        for (int j = 0; j < WIDTH; j++) {
-            if (l.number[j] < 0 && own->size) {
+        if (any(~l.busy)) {
+            int loaded = 0;
+            for (int j = 0; j < WIDTH && own->size; j++) {
+                if (l.busy[j]) continue;
                 long b = own->number[--own->size];
-                struct walk *w = walks + (b - first);
-                l.number[j] = b, l.walk[j] = w;
-                for (int i = 0; i < NX; i++) l.x[i][j] = w->x[i];
-                l.u[0][j] = w->torque, l.h[j] = w->h, l.elapsed[j] = w->elapsed;
-                for (int i = 1; i < NU; i++)
-                    if (job->clock[i]) l.u[i][j] = (w->tick - 1) * T;
-                enter(job, &l, j);
+                load(job, &l, j, st, walks + (b - first), b);
                 loaded = 1;
             }
-            if (l.number[j] < 0) l.span[j] = INFINITY, l.elapsed[j] = 0.0, l.walk[j] = &nobody;
-            else active++;
-        }
-        if (!active) return;
-        if (active < WIDTH && other->size >= WIDTH) {
-            for (int j = 0; j < WIDTH; j++)
-                if (l.number[j] >= 0) park(&l, j, own);
-            return;
-        }
-        if (loaded && (job->p_each || !prepared)) {
-            vd p[NP];
-            parameters_of(job, &l, p);
-            prepare(st, p, l.c);
-            prepared = 1;
+            if (!any(l.busy)) return;
+            if (any(~l.busy) && other->size >= WIDTH) {
+                for (int j = 0; j < WIDTH; j++)
+                    if (l.busy[j]) park(&l, j, own);
+                return;
+            }
+            if (loaded && (job->p_each || !prepared)) {
+                vd p[NP];
+                parameters_of(job, &l, p);
+                prepare(st, p, l.c);
+                l.length = p[job->length_at];
+#if HYBRID
+                if (st) prepare_land_1(p, l.landing);
+                else prepare_land_0(p, l.landing);
+#endif
+                prepared = 1;
+            }
         }
 
-        int asking = 0;
-        vi asks;
-        for (int j = 0; j < WIDTH; j++) {
-            asks[j] = l.number[j] >= 0 && l.walk[j]->left == 0 ? -1 : 0;
-            asking |= asks[j] != 0;
-        }
-        if (asking) {
-            vd away = SPLAT(2.0);
+        vi asks = (l.left == 0.0) & l.busy;
+        if (any(asks)) {
+            vi arrived = asks & 0, fallen = asks & ~(v_fabs(l.x[st]) < job->fall_angle);
             if (job->goal) {
                 const double *goal = job->goal + st * FORM;
-                away = SPLAT(0.0);
+                vd away = SPLAT(0.0);
                 for (int i = 0, k = 0; i < NL; i++)
                     for (int j = i; j < NL; j++, k++) away += goal[k] * l.x[i] * l.x[j];
+                arrived = asks & (away <= 1.0);
             }
             vd rate = job->pull > 0 ? phase_rate(job, &l) : SPLAT(1.0);
+            l.elapsed = v_select(asks & ~l.strange, l.elapsed + rate * T, l.elapsed);
+            vi special = asks & (l.strange | (l.elapsed >= l.span) | (l.tick >= l.samples));
             int ended = 0;
-            for (int j = 0; j < WIDTH; j++) {
-                if (!asks[j]) continue;
-                struct walk *w = l.walk[j];
-                int other_leg = job->leg[w->node] != st, outcome = RUNNING;
-                if (away[j] <= 1.0) outcome = ARRIVED;
-                else if (!(fabs(l.x[st][j]) < job->fall_angle)) outcome = FALLEN;
-                else if (other_leg && job->landing[w->node] < 0) outcome = LEFT;
-                else if (w->tick >= job->samples[l.number[j]]) outcome = TIMED_OUT;
-                if (outcome) {
-                    finish(job, &l, j, st, outcome);
-                    ended = 1, asks[j] = 0;
-                    continue;
+            if (any(special | arrived | fallen))
+                for (int j = 0; j < WIDTH; j++) {
+                    if (!(special[j] | arrived[j] | fallen[j])) continue;
+                    int node = l.walk[j]->node, outcome = RUNNING;
+                    if (arrived[j]) outcome = ARRIVED;
+                    else if (fallen[j]) outcome = FALLEN;
+                    else if (job->leg[node] != st && job->landing[node] < 0) outcome = LEFT;
+                    else if (l.tick[j] >= l.samples[j]) outcome = TIMED_OUT;
+                    if (outcome) {
+                        /* The sample at which it ends moves the reference no further. */
+                        if (!l.strange[j]) l.elapsed[j] -= rate[j] * T;
+                        finish(job, &l, j, st, outcome);
+                        ended = 1, asks[j] = 0;
+                    } else {
+                        advance(job, &l, j, st);
+                        l.strange[j] = 0;
+                    }
                 }
-                if (!w->fresh && !other_leg) l.elapsed[j] += rate[j] * T;
-                if (w->fresh || other_leg || l.elapsed[j] >= l.span[j]) advance(job, &l, j, st);
-                for (int i = 1; i < NU; i++)
-                    if (job->clock[i]) l.u[i][j] = w->tick * T;
-                w->fresh = 0, w->left = steps, w->tick++;
-                l.h[j] = T / steps;
-            }
             vd s = l.elapsed, law[LAW];
+#pragma GCC unroll 16
             for (int i = 0; i < LAW; i++)
                 law[i] = ((l.edge[3][i] * s + l.edge[2][i]) * s + l.edge[1][i]) * s + l.edge[0][i];
             vd torque = law[0];
@@ -341,29 +372,34 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
             torque += given;
 #endif
             vd feedback = SPLAT(0.0);
+#pragma GCC unroll 8
             for (int i = 0; i < NL; i++) feedback += law[1 + NL + i] * (l.x[i] - law[1 + i]);
             torque -= feedback;
             torque = v_fmin(v_fmax(torque, SPLAT(-job->limit)), SPLAT(job->limit));
             l.u[0] = v_select(asks, torque, l.u[0]);
+            l.h = v_select(asks, SPLAT(T / steps), l.h);
+            l.left = v_select(asks, SPLAT(steps), l.left);
+            l.tick = v_select(asks, l.tick + 1.0, l.tick);
             if (ended) continue;
         }
 
-        vd before[NX];
-        for (int i = 0; i < NX; i++) before[i] = l.x[i];
-        runge_kutta(st, l.x, l.u, l.c, l.h);
-        for (int j = 0; j < WIDTH; j++) l.walk[j]->left -= l.number[j] >= 0;
 #if HYBRID
         const int sw = 1 - st;
-        vd from = sum_of(job, before[st], before[sw]), to = sum_of(job, l.x[st], l.x[sw]);
-        vi down = ((before[sw] - before[st]) * from > 0.0)
-                  & ((l.x[sw] - l.x[st]) * to <= 0.0) & (from * to <= 0.0);
-        int any = 0;
-        for (int j = 0; j < WIDTH; j++) {
-            if (l.number[j] < 0) down[j] = 0;
-            any |= down[j] != 0;
-        }
-        if (any) land(job, &l, st, before, down, other);
+        vd from = sum_of(job, l.x[st], l.x[sw]), apart = l.x[sw] - l.x[st];
 #endif
+        for (int i = 1; i < NU; i++)
+            if (job->clock[i]) l.u[i] = v_select(l.busy, l.tick * T - l.left * l.h, l.u[i]);
+        vd x[NX];
+        for (int i = 0; i < NX; i++) x[i] = l.x[i];
+        runge_kutta(st, x, l.u, l.c, l.h);
+        l.left -= 1.0;
+#if HYBRID
+        vd to = sum_of(job, x[st], x[sw]);
+        vi down = (apart * from > 0.0) & ((x[sw] - x[st]) * to <= 0.0) & (from * to <= 0.0);
+        down &= l.busy;
+        if (any(down)) land(job, &l, st, x, down, other);
+#endif
+        for (int i = 0; i < NX; i++) l.x[i] = x[i];
     }
 }
 
@@ -378,7 +414,7 @@ int cgr_follow(const struct job *job, long first, long last)
         struct walk *w = walks + (b - first);
         for (int i = 0; i < NX; i++) w->x[i] = job->x[b * NX + i];
         w->torque = w->h = 0.0, w->elapsed = job->elapsed[b];
-        w->node = job->node[b], w->tick = w->left = w->visits = 0, w->fresh = 1;
+        w->node = job->node[b], w->visits = 0, w->tick = w->left = 0.0;
         struct queue *q = queue + job->stance[b];
         q->number[q->size++] = b;
     }

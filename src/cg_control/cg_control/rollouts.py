@@ -13,14 +13,15 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from cg_control.friction import friction_torque
-from cg_control.nodes import Nodes
+from cg_control.nodes import Nodes, triangles
 from cg_control.tracking import Tracker, TrackingSettings
-from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
+from cg_dynamics.assemble import acting_effects, parameter_vector
 from cg_dynamics.batch import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 from cg_dynamics.c_compiler import compiler, shared_library
 from cg_dynamics.compiled import CompiledModel, compile_model
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 SAMPLE_TIME = 0.002  # s
 LENGTH = 'leg_length'
 # Of struct job in rollouts.c, in its order.
-FIELDS = {
+FIELDS: dict[Any, tuple[str, ...]] = {
     ctypes.c_void_p: ('leg', 'next', 'landing', 'late', 'span', 'edge', 'cost', 'known', 'goal',
                       'p', 'x', 'elapsed', 'node', 'stance', 'samples', 'clock', 'outcome',
                       'impacts', 'time', 'visited', 'visit_cost', 'visit_state'),
@@ -194,13 +195,13 @@ class _Work:
 
     def in_lanes(self, library, compiled: CompiledModel, known, law, how, threads: int) -> None:
         nodes = self.nodes
-        forms = None if self.goal is None else _triangles(self.goal)
+        forms = None if self.goal is None else triangles(self.goal)
         # C sees addresses only: every array must be held by a name until it returns.
         arrays = {
             'leg': _whole(nodes.stance), 'next': _whole(nodes.next),
-            'landing': _whole(nodes.landing), 'late': _whole(nodes.late),
+            'landing': _whole(nodes.landing), 'late': np.ascontiguousarray(nodes.late),
             'span': np.ascontiguousarray(nodes.span), 'edge': nodes.edges,
-            'cost': _triangles(nodes.costs), 'known': parameter_vector(known, Setup()),
+            'cost': nodes.forms, 'known': parameter_vector(known, Setup()),
             'goal': forms, 'p': self.p, 'x': self.x, 'elapsed': self.elapsed, 'node': self.node,
             'stance': self.stance, 'samples': self.samples,
             'clock': _whole([name in CLOCKS for name in compiled.input_names]),
@@ -259,11 +260,8 @@ class _Work:
                 self.visited[b, seen], self.visit_cost[b, seen] = place, cost
                 self.visit_state[b, seen] = x[:nl]
                 seen += 1
-            inputs = walker.inputs(torque)
             try:
-                then, x = walker.move(
-                    leg, x, stamped(inputs, leg.compiled.input_names, t), how.sample_time
-                )
+                then, x = walker.move(leg, x, walker.inputs(torque), how.sample_time, t)
             except SimulationError:
                 then, x = leg, np.full(len(x), math.nan)
             self.impacts[b] += then.stance != leg.stance
@@ -335,7 +333,7 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
     legs = STANCES if hybrid else STANCES[:1]
     compiled = tuple(compile_model(robot, Setup(stance=leg)) for leg in legs)
     friction = None if compensated is None else friction_torque(compensated)
-    key = (*compiled, str(friction), friction and _acting(compensated))
+    key = (*compiled, None if compensated is None else _structure(compensated))
     if key in _sources:
         return _sources[key]
     codes, constants = [], 1
@@ -372,8 +370,8 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
     return _sources[key]
 
 
-def _acting(model: Model) -> tuple[str, ...]:
-    return tuple(effect.label for effect in acting_effects(model))
+def _structure(model: Model) -> tuple[tuple[str, ...], ...]:
+    return tuple(model.declarations), tuple(effect.label for effect in acting_effects(model))
 
 
 def _require_simple(robot: Model, compiled: CompiledModel, p: np.ndarray, law, how) -> None:
@@ -401,12 +399,6 @@ def _whole_states(compiled, nodes: Nodes, x: np.ndarray, start: np.ndarray, p) -
         compiled[leg].initial_state(one, u, row)
         for one, leg, row in zip(x, nodes.stance[start], rows, strict=True)
     ])  # fmt: skip
-
-
-def _triangles(forms: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (..., n, n) as coefficients of x_i x_j, i <= j: (..., n (n + 1) / 2)."""
-    i, j = np.triu_indices(forms.shape[-1])
-    return np.ascontiguousarray(forms[..., i, j] * np.where(i == j, 1.0, 2.0))
 
 
 def _whole(values) -> np.ndarray:

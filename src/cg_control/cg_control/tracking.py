@@ -210,10 +210,17 @@ class Tracker:
         return min(until, self._since_impact) <= self.settings.window
 
 
-def wrong_leg(trajectory: Trajectory, stance: str) -> str:
-    """Why a trajectory cannot begin while this leg stands; empty if it can."""
+def wrong_leg(trajectory: Trajectory, stance: str, at: float | None = None) -> str:
+    """Why a trajectory cannot begin while this leg stands; empty if it can.
+
+    Args:
+        trajectory: The motion.
+        stance: The leg.
+        at: Instant on the clock of the trajectory, s; None: its start.
+    """
     if stance not in STANCES:
         return f'stance is {stance!r}; allowed are {", ".join(STANCES)}'
-    if stance != trajectory.modes[0]:
-        return f'the trajectory begins on the {trajectory.modes[0]} leg, but {stance} stands'
+    leg = trajectory.modes[0 if at is None else trajectory.index_at(at)]
+    if stance != leg:
+        return f'the trajectory begins on the {leg} leg, but {stance} stands'
     return ''

@@ -2,6 +2,10 @@
 
 import pytest
 
+from cg_control.collocation import Options
+from cg_control.planning import plan
+from cg_control.task import Task
+from cg_control.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 
@@ -10,3 +14,21 @@ from cg_dynamics.model import Model
 def robot() -> Model:
     """The robot of the thesis, friction included."""
     return Model.load(model_path('compass_gait_mit'))
+
+
+@pytest.fixture(scope='session')
+def step(robot) -> Trajectory:
+    """From upright on the inner leg to upright on the outer leg, with feedback."""
+    return plan(robot, Task(('inner', 'outer'), reach=0.2), Options(fine=25))
+
+
+@pytest.fixture(scope='session')
+def back(robot) -> Trajectory:
+    """From upright on the outer leg to upright on the inner leg, with feedback."""
+    return plan(robot, Task(('outer', 'inner'), reach=0.2), Options(fine=25))
+
+
+@pytest.fixture(scope='session')
+def frictionless_step(robot) -> Trajectory:
+    """As `step`, planned without friction, which the controller is to compensate."""
+    return plan(robot, Task(('inner', 'outer'), reach=0.2), Options(fine=25), friction=False)

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cg_control.balance import BalanceController, balance_gains
 from cg_control.collocation import Options
-from cg_control.planning import CheckOptions, RejectedError, check, executed, plan
+from cg_control.execution import ExecutionSettings, TrajectoryController
 from cg_control.nodes import Nodes
+from cg_control.planning import CheckOptions, RejectedError, check, executed, plan
 from cg_control.task import Task
 from cg_control.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import TrajectoryError
@@ -15,11 +17,6 @@ from cg_dynamics.hybrid import WalkOptions
 
 OPTIONS = WalkOptions(sample_time=0.004, step=0.002, minimum_step=0.1, fall_angle=0.6)
 TASK = Task(('inner', 'outer'), reach=0.2)
-
-
-@pytest.fixture(scope='module')
-def step(robot):
-    return plan(robot, TASK, Options(fine=25))
 
 
 def rebalanced(done):
@@ -65,8 +62,8 @@ def test_a_motion_that_the_model_does_not_make_is_rejected(robot, step):
         plan(robot, TASK, Options(fine=25), checks=CheckOptions(closed_loop=1e-9))
 
 
-def test_friction_that_was_not_planned_is_compensated(robot):
-    step = plan(robot, TASK, Options(fine=25), friction=False)
+def test_friction_that_was_not_planned_is_compensated(robot, frictionless_step):
+    step = frictionless_step
     assert step.provenance['friction'] == 'to be compensated'
     done = executed(step, robot, TrackingSettings(), more=1.0, options=OPTIONS)
     assert rebalanced(done)
@@ -103,6 +100,59 @@ def test_phase_is_drawn_to_the_closest_point(robot, step):
         t = 0.002 * k
         tracker.torque(t, 'inner', step.phases[0].at(t + 0.06).state)
     assert tracker.s == pytest.approx(t + 0.06, abs=0.01)
+
+
+def test_it_starts_anywhere_along_the_motion(robot, step):
+    """From a node or between two, and then goes on as if it had come that way."""
+    nodes = Nodes.of(step, robot)
+    for s in (0.3, step.impact_times[0] + 0.1, step.duration):
+        whole, part = Tracker(nodes, robot), Tracker(nodes, robot)
+        part.begin(*nodes.locate(s))
+        assert part.s == pytest.approx(s)
+        point = step.at(s)
+        stance = step.modes[step.index_at(s)]
+        away = np.array([0.001, -0.001, 0.005, 0.002])
+        gain = nodes.K[0] if part.done else point.gain
+        nominal = 0.0 if part.done else point.torque
+        x = point.state + away
+        first = part.torque(7.0, stance, x)
+        assert first == pytest.approx(nominal - gain @ away, abs=1e-9)
+        whole.begin(nodes.first)
+        whole.torque(-s, step.modes[0], step.states[0])
+        if stance != step.modes[0]:
+            whole.torque(-s + step.impact_times[0], stance, step.phases[1].states[0])
+        assert whole.torque(0.0, stance, x) == pytest.approx(first, abs=1e-8)
+    with pytest.raises(ValueError, match='there are nodes 0 to'):
+        part.begin(len(nodes))
+    with pytest.raises(ValueError, match='elapsed is -1'):
+        part.begin(0, -1.0)
+
+
+def test_a_landing_that_nobody_planned_gets_no_torque(robot, step):
+    tracker = Tracker(Nodes.of(step, robot), robot)
+    tracker.begin(tracker.nodes.landing[tracker.nodes.first])
+    x = step.phases[1].states[0]
+    assert tracker.torque(0.0, 'outer', x) != 0.0
+    assert not tracker.left('outer')
+    assert tracker.torque(0.002, 'inner', x) == 0.0
+    assert tracker.left('inner')
+    assert tracker.torque(0.004, 'outer', x) != 0.0
+
+
+def test_a_trajectory_can_be_entered_in_its_middle(robot, step):
+    settings = ExecutionSettings(start_tolerance=0.02)
+    gains = balance_gains(robot, settings, 0.002)
+    controller = TrajectoryController(BalanceController(robot, settings, gains), robot, settings)
+    s = step.impact_times[0] + 0.6
+    x = step.at(s).state
+    assert controller.step(0, 'outer', x).mode == 'balancing'
+    assert 'inner leg, but outer stands' in controller.start(step)
+    assert 'from the start' in controller.start(step, at=step.impact_times[0] + 0.01)
+    assert 'the trajectory goes from' in controller.start(step, at=step.duration + 1.0)
+    assert controller.start(step, at=s) == ''
+    assert controller.step(2_000_000, 'outer', x).mode == 'tracking'
+    assert controller.step(2_000_000 + round((step.duration - s) * 1e9) + 1, 'outer',
+                           np.zeros(4)).mode == 'caught'  # fmt: skip
 
 
 def test_doubt_gives_no_torque(robot, step):

@@ -308,7 +308,7 @@ class Walker:
         return Leg(stance, self.compiled[stance])
 
     def move(
-        self, leg: 'Leg', x: np.ndarray, u: np.ndarray, duration: float
+        self, leg: 'Leg', x: np.ndarray, u: np.ndarray, duration: float, begin: float | None = None
     ) -> tuple['Leg', np.ndarray]:
         """Move on with inputs held; nothing of it is kept but the end.
 
@@ -317,12 +317,16 @@ class Walker:
             x: State, shape (nx,).
             u: Inputs that act, shape (nu,).
             duration: In s.
+            begin: Instant at which it begins in s, for the clocks of effects; None leaves them
+                as they stand in u.
 
         Returns:
             The phase then, which may be another one, and its state.
         """
         t = 0.0
         while t < duration - INSTANT:
+            if begin is not None:
+                u = stamped(u, leg.compiled.input_names, begin + t)
             steps = max(1, math.ceil((duration - t) / self.step - 1e-9))
             t, x, event = self._one_step(leg, t, x, u, (duration - t) / steps)
             if event is not None and event.kind not in ('scuff', 'fall'):
