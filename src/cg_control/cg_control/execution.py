@@ -71,6 +71,8 @@ class TrajectoryController:
         if self._fallen or self.mode not in (BALANCING, CAUGHT):
             return f'the robot is {self.mode}, not balancing'
         stance, x = self._state
+        if not 0.0 <= at <= trajectory.duration:
+            return f'at is {at} s; the trajectory takes {trajectory.duration:.3g} s'
         begin = trajectory.phases[0].start + at
         problem = wrong_leg(trajectory, stance, begin)
         if problem:

@@ -367,7 +367,7 @@ def _beyond(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Instants, states and rates after a phase, as the model moves on under its last torque."""
     nx = phase.states.shape[1]
-    time, states, rates = [], [np.zeros((0, nx))], [np.zeros((0, nx))]
+    states = [np.zeros((0, nx))]
     planned, setup = planning_model(model, not tree.compensate), Setup(stance=phase.stance)
     compiled, p = compile_model(planned, setup), parameter_vector(planned, setup)
     x, u = phase.states[-1].copy(), np.array([phase.torque[-1]])
@@ -375,7 +375,8 @@ def _beyond(
         compiled.advance(x, u, p, LATE_KNOT / 5, 5)
         if np.abs(x[:2]).max() > FALLING:
             break
-        time.append(phase.end + k * LATE_KNOT)
         states.append(x.copy()[None])
-        rates.append(np.asarray(compiled.f(x, u, p)).T)
-    return np.array(time), np.vstack(states), np.vstack(rates)
+    found = np.vstack(states)
+    n = len(found)
+    rates = np.asarray(compiled.f(found.T, u, p)).T if n else found
+    return phase.end + LATE_KNOT * np.arange(1, n + 1), found, rates

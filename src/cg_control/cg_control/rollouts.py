@@ -10,6 +10,7 @@ import ctypes
 import enum
 import logging
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ import numpy as np
 from cg_control.friction import friction_torque
 from cg_control.nodes import Nodes, triangles
 from cg_control.tracking import Tracker, TrackingSettings
-from cg_dynamics.assemble import acting_effects, parameter_vector
+from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
 from cg_dynamics.batch import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 from cg_dynamics.c_compiler import compiler, shared_library
 from cg_dynamics.compiled import CompiledModel, compile_model
@@ -244,15 +245,15 @@ class _Work:
             own = robot.with_values(dict(zip(names, p.tolist(), strict=True)))
             tracker = Tracker(self.nodes, known, law, int(self.node[b]))
             tracker.begin(int(self.node[b]), float(self.elapsed[b]))
-            self._walk(b, Walker(own, how, None), tracker, how)
+            self._one(b, _mover(own, how), tracker, how)
 
-    def _walk(self, b: int, walker: Walker, tracker: Tracker, how: WalkOptions) -> None:
+    def _one(self, b: int, move: 'Mover', tracker: Tracker, how: WalkOptions) -> None:
         nodes, nl = self.nodes, self.nodes.x0.shape[1]
-        leg, x, tick, seen = walker.stand(STANCES[self.stance[b]]), self.x[b].copy(), 0, 0
-        while not (outcome := self._outcome(b, leg.stance, x, tick, tracker.node, how)):
+        leg, x, tick, seen = int(self.stance[b]), self.x[b].copy(), 0, 0
+        while not (outcome := self._outcome(b, leg, x, tick, tracker.node, how)):
             t, node = tick * how.sample_time, tracker.node
-            torque = tracker.torque(t, leg.stance, x)
-            passed = _passed(nodes, node, tracker.node, STANCES.index(leg.stance))
+            torque = tracker.torque(t, STANCES[leg], x)
+            passed = _passed(nodes, node, tracker.node, leg)
             if tick == 0:
                 passed = [node, *passed]
             cost = nodes.cost_to_go(tracker.node, tracker.elapsed, x[:nl])
@@ -261,18 +262,18 @@ class _Work:
                 self.visit_state[b, seen] = x[:nl]
                 seen += 1
             try:
-                then, x = walker.move(leg, x, walker.inputs(torque), how.sample_time, t)
+                then, x = move(leg, x, torque, t)
             except SimulationError:
                 then, x = leg, np.full(len(x), math.nan)
-            self.impacts[b] += then.stance != leg.stance
+            self.impacts[b] += then != leg
             leg, tick = then, tick + 1
-        self.x[b], self.stance[b], self.outcome[b] = x, STANCES.index(leg.stance), outcome
+        self.x[b], self.stance[b], self.outcome[b] = x, leg, outcome
         self.time[b] = tick * how.sample_time
         self.node[b], self.elapsed[b] = tracker.node, tracker.elapsed
 
-    def _outcome(self, b: int, stance: str, x, tick: int, node: int, how) -> int:
+    def _outcome(self, b: int, leg: int, x, tick: int, node: int, how) -> int:
         """An `Outcome`, or zero while the rollout goes on."""
-        leg, motion = STANCES.index(stance), x[: self.nodes.x0.shape[1]]
+        motion = x[: self.nodes.x0.shape[1]]
         if self.goal is not None and motion @ self.goal[leg] @ motion <= 1.0:
             return Outcome.ARRIVED
         if not abs(x[leg]) < how.fall_angle:
@@ -280,6 +281,35 @@ class _Work:
         if self.nodes.stance[node] != leg and self.nodes.landing[node] < 0:
             return Outcome.LEFT
         return Outcome.TIMED_OUT if tick >= self.samples[b] else 0
+
+
+# (leg, x, torque in N m, instant in s) -> leg and x a sample later.
+Mover = Callable[[int, np.ndarray, float, float], tuple[int, np.ndarray]]
+
+
+def _mover(robot: Model, how: WalkOptions) -> Mover:
+    """The motion of a robot over one sample: that of `walk`, or of a machine without feet."""
+    if isinstance(robot.mechanism, CompassGait):
+        walker = Walker(robot, how, None)
+        legs = [walker.stand(stance) for stance in STANCES]
+
+        def walk(leg: int, x, torque: float, t: float):
+            then, y = walker.move(legs[leg], x, walker.inputs(torque), how.sample_time, t)
+            return STANCES.index(then.stance), y
+
+        return walk
+    compiled, p = compile_model(robot, Setup()), parameter_vector(robot, Setup())
+    steps = max(1, math.ceil(how.sample_time / min(how.step, compiled.largest_step) - 1e-9))
+    h = how.sample_time / steps
+
+    def swing(leg: int, x, torque: float, t: float):
+        y, u = x.copy(), np.ones(compiled.nu)
+        u[0] = torque
+        for k in range(steps):
+            compiled.advance(y, stamped(u, compiled.input_names, t + k * h), p, h, 1)
+        return leg, y
+
+    return swing
 
 
 def _passed(nodes: Nodes, node: int, end: int, leg: int) -> list[int]:

@@ -9,9 +9,13 @@ from cg_control import rollouts as module
 from cg_control.nodes import Nodes
 from cg_control.rollouts import Outcome, follow
 from cg_control.tracking import Tracker, TrackingSettings
+from cg_description.paths import model_path
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.batch import Feedback, simulate_batch
 from cg_dynamics.c_compiler import compiler
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.hybrid import WalkOptions, walk
+from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
 OPTIONS = WalkOptions(sample_time=0.002, step=0.002)
@@ -230,6 +234,32 @@ def test_visits_say_at_which_cost_each_node_was_passed(robot, tree):
     few = follow(tree, robot, start, x, 5.0, visits=5)
     np.testing.assert_array_equal(few.visits.node, found.visits.node[:, :5])
     assert follow(tree, robot, start, x, 0.1).visits is None
+
+
+@pytest.mark.parametrize('compiled', [True, False])
+def test_machine_without_feet(compiled, monkeypatch):
+    """A pendulum held upright, against the batch of cg_dynamics."""
+    pendulum = Model.load(model_path('sydney_pendulum'))
+    torque = pendulum.values['gravity_torque']
+    pendulum = pendulum.with_values({'gravity_torque': -torque})
+    K = torque * np.array([3.0, 0.7])
+    nodes = Nodes.root('inner', K, np.eye(2), pendulum.hash)
+    if not compiled:
+        monkeypatch.setattr(module, 'rollout_library', lambda *_: None)
+    x = np.random.default_rng(13).uniform(-0.3, 0.3, (11, 2))
+    x[2], x[5] = [0.9, 40.0], [0.0, 0.01]
+    goal = np.array([np.eye(2) / 0.02**2, np.full((2, 2), np.nan)])
+    found = follow(nodes, pendulum, np.zeros(11, int), x, 1.0)
+    time, limit = np.arange(501) * 0.002, np.array([pendulum.torque_limit])
+    law = Feedback(np.tile(K, (501, 1, 1)), np.zeros((501, 2)), limit)
+    p = parameter_vector(pendulum, Setup())
+    end = simulate_batch(pendulum, Setup(), time, np.zeros((501, 1)), x, p, feedback=law)
+    stood = found.outcome == Outcome.TIMED_OUT
+    np.testing.assert_allclose(found.state[stood], end[stood], rtol=0, atol=1e-11)
+    assert not stood[2]
+    arrived = follow(nodes, pendulum, np.zeros(11, int), x, 1.0, goal=goal)
+    assert arrived.outcome[5] == Outcome.ARRIVED
+    assert arrived.time[5] == 0
 
 
 def test_no_rollouts_are_no_error(robot, tree):

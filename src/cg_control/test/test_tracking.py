@@ -112,9 +112,10 @@ def test_it_starts_anywhere_along_the_motion(robot, step):
         point = step.at(s)
         stance = step.modes[step.index_at(s)]
         away = np.array([0.001, -0.001, 0.005, 0.002])
-        gain = nodes.K[0] if part.done else point.gain
-        nominal = 0.0 if part.done else point.torque
-        x = point.state + away
+        ended = s == step.duration
+        gain = nodes.K[0] if ended else point.gain
+        nominal = 0.0 if ended else point.torque
+        x = (0 if ended else point.state) + away
         first = part.torque(7.0, stance, x)
         assert first == pytest.approx(nominal - gain @ away, abs=1e-9)
         whole.begin(nodes.first)
@@ -148,7 +149,7 @@ def test_a_trajectory_can_be_entered_in_its_middle(robot, step):
     assert controller.step(0, 'outer', x).mode == 'balancing'
     assert 'inner leg, but outer stands' in controller.start(step)
     assert 'from the start' in controller.start(step, at=step.impact_times[0] + 0.01)
-    assert 'the trajectory goes from' in controller.start(step, at=step.duration + 1.0)
+    assert 'the trajectory takes' in controller.start(step, at=step.duration + 1.0)
     assert controller.start(step, at=s) == ''
     assert controller.step(2_000_000, 'outer', x).mode == 'tracking'
     assert controller.step(2_000_000 + round((step.duration - s) * 1e9) + 1, 'outer',
