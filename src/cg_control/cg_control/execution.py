@@ -126,7 +126,8 @@ class TrajectoryController:
             return Command(0.0, FALLEN, reason)
         torque = self._tracker.torque(stamp_ns * 1e-9, stance, x)
         limit = self.balance.torque_limit
-        return Command(min(max(torque, -limit), limit), self.mode)
+        reason = 'the foot landed where none should' if self._tracker.left(stance) else ''
+        return Command(min(max(torque, -limit), limit), self.mode, reason)
 
 
 __all__ = ['CAUGHT', 'TRACKING', 'ExecutionSettings', 'TrajectoryController']

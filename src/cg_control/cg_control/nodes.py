@@ -137,6 +137,47 @@ class Nodes:
         """First node of the trajectory that was grafted last."""
         return int(np.argmax(self.branch == self.branch.max()))
 
+    def require_consistency(self) -> None:
+        """Refuse arrays that are no tree; those that `root` and `grafted` make always are one.
+
+        Raises:
+            TrajectoryError: naming the array, the node and what is allowed.
+        """
+        n, nx = len(self), self.x0.shape[-1]
+        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'S': (nx, nx)}
+        for name in ARRAYS:
+            array, shape = getattr(self, name), (n, *tails.get(name, ()))
+            if np.shape(array) != shape:
+                raise TrajectoryError(f'{name} has shape {np.shape(array)}, expected {shape}')
+            finite = name not in ('span', 'rho')
+            if np.isnan(array).any() or (finite and not np.isfinite(array).all()):
+                raise TrajectoryError(f'{name} must be finite numbers')
+        rests = self.next < 0
+        follow, land = np.maximum(self.next, 0), np.maximum(self.landing, 0)
+        rules = {
+            f'stance must be 0 to {len(STANCES) - 1}':
+                (self.stance < 0) | (self.stance >= len(STANCES)),
+            f'next must be -1 to {n - 1}': (self.next < -1) | (self.next >= n),
+            f'landing must be -1 to {n - 1}': (self.landing < -1) | (self.landing >= n),
+            'span must be infinite where next is -1, finite and not negative elsewhere':
+                (self.span < 0) | (np.isinf(self.span) != rests),
+            'rho must not be negative': self.rho < 0,
+        }  # fmt: skip
+        for rule, broken in rules.items():
+            if broken.any():
+                raise TrajectoryError(f'node {np.argmax(broken)}: {rule}')
+        rules = {
+            'next must be on the same leg': ~rests & (self.stance[follow] != self.stance),
+            'landing must be on the other leg':
+                (self.landing >= 0) & (self.stance[land] == self.stance),
+            # So that no reference runs round for ever in no time.
+            'a link must lead to an older branch':
+                (self.span == 0) & (self.branch[follow] >= self.branch),
+        }  # fmt: skip
+        for rule, broken in rules.items():
+            if broken.any():
+                raise TrajectoryError(f'node {np.argmax(broken)}: {rule}')
+
     def locate(self, s: float) -> tuple[int, float]:
         """Node and time since for an instant on the clock of the last trajectory, s."""
         mine = np.flatnonzero((self.branch == self.branch.max()) & ~self.late)
@@ -371,7 +412,7 @@ def _beyond(
     planned, setup = planning_model(model, not tree.compensate), Setup(stance=phase.stance)
     compiled, p = compile_model(planned, setup), parameter_vector(planned, setup)
     x, u = phase.states[-1].copy(), np.array([phase.torque[-1]])
-    for k in range(1, math.ceil(late / LATE_KNOT) + 1):
+    for _ in range(math.ceil(late / LATE_KNOT)):
         compiled.advance(x, u, p, LATE_KNOT / 5, 5)
         if np.abs(x[:2]).max() > FALLING:
             break

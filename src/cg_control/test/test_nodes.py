@@ -143,3 +143,29 @@ def test_what_does_not_fit_is_refused(robot, step, back):
         forth.locate(step.duration + 1.0)
     with pytest.raises(ValueError, match='cost_to_go has shape'):
         Nodes.root('inner', np.zeros(4), np.eye(3), robot.hash)
+
+
+@pytest.mark.parametrize(
+    ('name', 'node', 'value', 'message'),
+    [
+        ('stance', 5, 2, 'node 5: stance must be 0 to 1'),
+        ('next', 5, 10_000, 'node 5: next must be -1 to'),
+        ('next', 5, -1, 'node 5: span must be infinite where next is -1'),
+        ('next', 5, 60, 'node 5: next must be on the same leg'),
+        ('landing', 5, -2, 'node 5: landing must be -1 to'),
+        ('landing', 5, 6, 'node 5: landing must be on the other leg'),
+        ('span', 5, -0.1, 'node 5: span must be infinite where'),
+        ('span', 5, 0.0, 'node 5: a link must lead to an older branch'),
+        ('rho', 5, -1.0, 'node 5: rho must not be negative'),
+        ('u0', 5, np.nan, 'u0 must be finite numbers'),
+        ('K', 5, np.inf, 'K must be finite numbers'),
+    ],
+)
+def test_arrays_that_are_no_tree_are_refused(tree, name, node, value, message):
+    tree.require_consistency()
+    array = getattr(tree, name).copy()
+    array[node] = value
+    with pytest.raises(TrajectoryError, match=message):
+        replace(tree, **{name: array}).require_consistency()
+    with pytest.raises(TrajectoryError, match='has shape'):
+        replace(tree, **{name: array[:-1]}).require_consistency()
