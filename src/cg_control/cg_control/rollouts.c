@@ -6,7 +6,8 @@
      prepare_land_s(p, c), land_s(x, u, c, v)   rates (2) after the impact that ends stance s
    and, if COMPENSATE, of the known model:
      prepare_taken(p, c), taken(rate, u, c, torque)
-   and the sizes NX, NU, NP, NL (states that the law looks at), CONSTANTS, and NK, the parameters of the known one.
+   and the sizes NX, NU, NP, NL (states that the law looks at), CONSTANTS, NK (parameters of the
+   known model), and STILL of the law.
 
    The law is (FOL) of docs/trajectories.md, the same as in tracking.py; events are those of
    cg_dynamics/hybrid.py. Rollouts have clocks of their own: a lane that ends takes the next one
@@ -16,11 +17,9 @@
 
 #define LAW (1 + 2 * NL)
 #define FORM (NL * (NL + 1) / 2)
-#define INSTANT 1e-12
+#define INSTANT 1e-12   /* s: less is nothing */
 #define NEWTON 60
-#define CONVERGED 1e-13
-#define LIMIT_OF_STATES 1e6
-#define STILL 1e-3
+#define CONVERGED 1e-13 /* s; the next step of Newton's method would be rounding */
 
 enum { RUNNING, ARRIVED, FALLEN, LEFT, TIMED_OUT };
 
@@ -407,6 +406,7 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
 int cgr_follow(const struct job *job, long first, long last)
 {
     long count = last - first;
+    if (count <= 0) return 0;
     struct walk *walks = malloc(count * sizeof *walks);
     struct queue queue[2] = {{malloc(count * sizeof(long)), 0}, {malloc(count * sizeof(long)), 0}};
     int failed = !walks || !queue[0].number || !queue[1].number;

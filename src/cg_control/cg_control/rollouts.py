@@ -21,7 +21,7 @@ import numpy as np
 
 from cg_control.friction import friction_torque
 from cg_control.nodes import Nodes, triangles
-from cg_control.tracking import Tracker, TrackingSettings
+from cg_control.tracking import STILL, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
 from cg_dynamics.batch import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 from cg_dynamics.c_compiler import compiler, shared_library
@@ -63,7 +63,9 @@ class Outcome(enum.IntEnum):
 class Visits:
     """The nodes that each rollout came by, in order, its start first; V is the room for them.
 
-    A node counts as visited at the first sample at which the reference is at it or beyond.
+    A node counts as visited at the first sample at which the reference is at it or beyond. Where
+    a rollout fails, rho of these nodes is too large if it exceeds `cost`; nodes that the
+    reference skipped, as the foot landed early, are not among them.
 
     Attributes:
         node: Index, -1 where there are no more, shape (B, V).
@@ -390,6 +392,7 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
         'NL': 2 * compiled[0].equations.coordinates, 'HYBRID': int(hybrid),
         'COMPENSATE': int(friction is not None),
         'NK': 0 if friction is None else friction.size1_in(1), 'CONSTANTS': constants,
+        'STILL': STILL,
     }  # fmt: skip
     _sources[key] = '\n'.join([
         *(f'#define {name} {value}' for name, value in sizes.items()),
