@@ -319,7 +319,7 @@ class Mapping(Kind):
         return [name for name, key in self.keys.items() if key.default is NEEDED]
 
     def read(self, value: Any, place: Place) -> dict[str, Any]:
-        """All known keys, those of the file in its order, then the others with their defaults."""
+        """The entries in the order of the file, then the known ones that are absent, by default."""
         if value is None and not self.needed:
             value = {}
         if value is None:
@@ -335,14 +335,13 @@ class Mapping(Kind):
                 f'unknown entry {shown(name)}; allowed: {", ".join(self.keys)}'
                 f'{meant(name, self.keys)}'
             )
-        order = dict.fromkeys((*(name for name in value if name in self.keys), *self.keys))
-        found = {
-            name: self._entry(name, value, place)
-            for name in order
-            if self.fill or value.get(name) is not None or self.keys[name].default is NEEDED
-        }
-        return found | {name: Anything().read(entry, place.key(name))
-                        for name, entry in others.items()}
+        found = {}
+        for name in dict.fromkeys((*value, *self.keys)):
+            if name in others:
+                found[name] = Anything().read(others[name], place.key(name))
+            elif self.fill or value.get(name) is not None or self.keys[name].default is NEEDED:
+                found[name] = self._entry(name, value, place)
+        return found
 
     def _entry(self, name: str, value: dict[str, Any], place: Place) -> Any:
         key, entry, place = self.keys[name], value.get(name), place.key(name)
