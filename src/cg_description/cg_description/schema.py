@@ -319,7 +319,7 @@ class Mapping(Kind):
         return [name for name, key in self.keys.items() if key.default is NEEDED]
 
     def read(self, value: Any, place: Place) -> dict[str, Any]:
-        """The entries in the order of the file, then the known ones that are absent, by default."""
+        """The entries in the order of the file, then known ones that are absent, by default."""
         if value is None and not self.needed:
             value = {}
         if value is None:
