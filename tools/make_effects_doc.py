@@ -18,6 +18,11 @@ PLACES = {
     'timing': 'in time',
 }
 
+FRICTION = {
+    'dry': 'dry friction; linear designs leave it out',
+    'viscous': 'viscous friction; linear designs keep it',
+}
+
 
 def number(value: float) -> str:
     """A number as it stands in a model file."""
@@ -51,6 +56,10 @@ def section(effect, mechanisms) -> list[str]:
     if recorded:
         names = ', '.join(f'`{name}`' for name in recorded)
         lines.append(f'Needs in the recording: {names}.')
+    if effect.friction:
+        lines.append(f'For controllers: {FRICTION[effect.friction]}.')
+    if effect.ripple:
+        lines.append('For controllers: a ripple; linear designs leave it out.')
     if math.isfinite(effect.largest_step):
         lines.append(f'Longest step of integration: {1e3 * effect.largest_step:g} ms.')
     lines += [
@@ -63,7 +72,7 @@ def section(effect, mechanisms) -> list[str]:
         neutral = '-' if p.neutral is None else number(p.neutral)
         free = 'yes' if p.free else 'shape' if p.leeway else 'choice' if p.choice else 'no'
         lines.append(
-            f'| `{p.name}` | {p.unit} | {p.description} | {number(p.lower)} to {number(p.upper)} '
+            f'| `{p.name}` | {p.unit}{f" ({p.along})" if p.along else ""} | {p.description} | {number(p.lower)} to {number(p.upper)} '
             f'| {neutral} | {starts} | {free} |'
         )
     return [*lines, '']
@@ -73,7 +82,9 @@ def page() -> str:
     """The whole page."""
     from cg_dynamics.effects import LIBRARY
     from cg_dynamics.mechanisms import MECHANISMS
+    from cg_dynamics.parameter import SLIDING
 
+    sliding = ', '.join(f'{turning} becomes {slid}' for turning, slid in SLIDING.items())
     lines = [
         '# Effects',
         '',
@@ -86,6 +97,10 @@ def page() -> str:
         '"shape" those of the shape of a law, which a diagnosis lets go within bounds, '
         '"choice" one that stays at that of its starts which explains most. A new effect is '
         'one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
+        '',
+        'Units are those of a joint that turns. At a joint that slides, and in a sensor that reads '
+        f'a length, {sliding}: friction in N m s/rad is one in N s/m there. Where that is not '
+        'so, the unit at such a joint is in brackets.',
         '',
     ]
     for place, words in PLACES.items():

@@ -260,7 +260,7 @@ class BalanceController:
         self._law = law
         torque = self._smoothed(wanted + self._offset, elapsed)
         self._torque, self._last_ns = torque, stamp_ns
-        torque += self.friction.torque(x[2] - x[3], self.settings)
+        torque += self.friction.torque(x[0] - x[1], x[2] - x[3], self.settings)
         torque = min(max(torque, -self.torque_limit), self.torque_limit)
         return Command(torque, self.mode)
 

@@ -25,12 +25,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_control.linearise import linearise_stance, without_extra_states
+from cg_control.linearise import linearise_stance
 from cg_description.reading import parse_yaml, read_text
 from cg_description.schema import Key, ListOf, Mapping, Number, Text
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import Feedback, simulate_batch
 from cg_dynamics.compiled import compile_model
+from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
@@ -79,7 +80,7 @@ class Modes:
 def modes_of(model: Model, stance: str) -> Modes:
     """(MODES) of a model's linearisation upright; friction, which damps the swing, left out."""
     for effect in model.effects:
-        if effect.place == 'joint':
+        if effect.place == 'joint' or effect.friction:
             model = model.without_effect(effect.label)
     linear = linearise_stance(model, stance)
     values, left = np.linalg.eig(linear.A.T)

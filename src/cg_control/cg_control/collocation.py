@@ -8,15 +8,16 @@ differ in durations and in the pose at the impact.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from cg_control.friction import compensated
 from cg_control.program import GUESSES, WEAK, Program, Solution
 from cg_control.task import Box, Ellipsoid, Task
 from cg_control.trajectory import Trajectory
-from cg_dynamics.linearise import DRY_FRICTION
+from cg_description.model_file import Quantity
+from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 
-JOINT_FRICTION = (*DRY_FRICTION, 'viscous_friction', 'quadratic_friction')
 SOFT_TRANSITION = 0.2  # rad/s
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 ELASTIC_ITERATIONS = 60
@@ -52,18 +53,28 @@ def planning_model(model: Model, friction: bool = True) -> Model:
     Args:
         model: The robot.
         friction: Keep what the joints rub. Without it a controller has to add it, as the
-            friction compensator of the thesis does.
+            friction compensator of the thesis does: what it gives back is left out here.
     """
+    model = without_extra_states(model)
     for effect in model.effects:
+        limit = effect.torque_limit(model.values_of(effect))
+        if limit < model.torque_limit:
+            model = _limited(model, effect.site, limit)
         if (
-            effect.states
-            or effect.extra_inputs
-            or effect.place in ('sensor', 'timing')
-            or effect.name in ('torque_saturation', 'actuator_delay')
-            or (effect.name in JOINT_FRICTION and not friction)
+            effect.place in ('sensor', 'timing')
+            or math.isfinite(limit)
+            or (compensated(effect) and not friction)
         ):
             model = model.without_effect(effect.label)
     return model
+
+
+def _limited(model: Model, joint: str, limit: float) -> Model:
+    """The model with this limit of a joint's actuator: a bound of the plan, not a corner."""
+    index = list(model.mechanism.joints).index(joint)
+    channel, unit = model.mechanism.inputs[index], model.mechanism.input_units[index]
+    stated = {**model.actuators.get(channel, {}), 'limit': Quantity(limit, unit)}
+    return replace(model, actuators={**model.actuators, channel: stated})
 
 
 def softened(model: Model) -> Model:
@@ -71,11 +82,10 @@ def softened(model: Model) -> Model:
 
     A few intervals cannot follow a change within 0.01 rad/s, and need not.
     """
-    values = model.values
     return model.with_values({
-        name: max(values[name], SOFT_TRANSITION)
-        for name in values
-        if name.endswith('.transition_rate')
+        name: max(model.values[name], SOFT_TRANSITION)
+        for name, parameter in model.declarations.items()
+        if parameter.smoothing
     })
 
 

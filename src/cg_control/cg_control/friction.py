@@ -1,17 +1,20 @@
 """Friction compensation: the torque that the model's joint friction takes, given back (Eq. 4.12).
 
-    tau = u + share fade(|w|) clip(tau_f(w))                                          (FRIC)
+    tau = u + share fade(|w|) clip(tau_f(a, w))                                       (FRIC)
 
-tau_f is what the friction effects of the model take at the hip rate w. Around standstill the rate
-is mostly noise and its sign a toss, so nothing is given back inside the deadband; beyond it the
-compensation fades in over as much again.
+tau_f is what the friction effects of the model take at the hip angle a and rate w. Around
+standstill the rate is mostly noise and its sign a toss, so nothing is given back inside the
+deadband; beyond it the compensation fades in over as much again.
 """
 
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from cg_dynamics.assemble import acting_effects, parameter_names, parameter_vector
+from cg_dynamics.effects import Effect
+from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.settings import Settings, setting
@@ -39,24 +42,32 @@ class FrictionSettings(Settings):
     )
 
 
+def compensated(effect: Effect) -> bool:
+    """Whether a friction is one that the motor of its joint can give back."""
+    return bool(effect.friction) and effect.place == 'joint'
+
+
 class FrictionCompensation:
-    """(FRIC) for the hip of a model.
+    """(FRIC) for one joint of a model.
+
+    Friction that depends on the load or on a clock is left to the controller; of a friction with
+    states its level counts.
 
     Args:
-        model: Its friction effects without states count; friction that depends on the load is
-            left to the controller.
+        model: Its friction at that joint.
+        joint: The joint; None takes the first.
     """
 
-    def __init__(self, model: Model):
-        self._taken = friction_torque(model)
-        self._p = parameter_vector(model, Setup())
+    def __init__(self, model: Model, joint: str | None = None):
+        self._taken = friction_torque(model, joint)
+        self._p = friction_parameters(model)
 
-    def taken(self, rate: float) -> float:
-        """Torque in N m that friction takes at a hip rate in rad/s; it has the rate's sign."""
-        return float(self._taken(rate, self._p))
+    def taken(self, angle: float, rate: float) -> float:
+        """Torque in N m that friction takes at a joint's angle and rate, in rad and rad/s."""
+        return float(self._taken(angle, rate, self._p))
 
-    def torque(self, rate: float, settings: FrictionSettings) -> float:
-        """What is to be added to the command at a hip rate in rad/s, N m."""
+    def torque(self, angle: float, rate: float, settings: FrictionSettings) -> float:
+        """What is to be added to the command at a joint's angle and rate, N m."""
         if not settings.friction_compensation:
             return 0.0
         speed, deadband = abs(rate), settings.friction_deadband
@@ -64,22 +75,27 @@ class FrictionCompensation:
             return 0.0
         fade = 1.0 if deadband == 0.0 else min(1.0, (speed - deadband) / deadband)
         limit = settings.friction_limit
-        return settings.friction_share * fade * min(max(self.taken(rate), -limit), limit)
+        return settings.friction_share * fade * min(max(self.taken(angle, rate), -limit), limit)
 
 
-def friction_torque(model: Model) -> ca.Function:
-    """(rate, p) -> tau_f of (FRIC), with the parameter vector of the model on either leg."""
+def friction_parameters(model: Model) -> np.ndarray:
+    """The p of `friction_torque`, shape (np,)."""
+    return parameter_vector(without_extra_states(model), Setup())
+
+
+def friction_torque(model: Model, joint: str | None = None) -> ca.Function:
+    """(angle, rate, p) -> tau_f of (FRIC) at a joint; arguments as of `FrictionCompensation`."""
+    joint = joint or next(iter(model.mechanism.joints))
+    model = without_extra_states(model)
     names = parameter_names(model, Setup())
     p = ca.SX.sym('p', len(names))
     by_name = dict(zip(names, ca.vertsplit(p), strict=True))
-    rate, torque = ca.SX.sym('rate'), ca.SX(0)
+    angle, rate, load = (ca.SX.sym(name) for name in ('angle', 'rate', 'load'))
+    torque = ca.SX(0)
     for effect in acting_effects(model):
-        if (
-            effect.place == 'joint'
-            and 'friction' in effect.name
-            and not (effect.states or effect.extra_inputs)
-        ):
+        if compensated(effect) and effect.site == joint:
             own = {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
-            added, _ = effect.joint_torque(ca.SX(0), rate, ca.SX(0), [], own)
-            torque = torque - added
-    return ca.Function('friction', [rate, p], [torque])
+            added, _ = effect.joint_torque(angle, rate, load, [], own)
+            if not ca.depends_on(added, load):
+                torque = torque - added
+    return ca.Function('friction', [angle, rate, p], [torque])

@@ -15,18 +15,21 @@ import numpy as np
 from scipy.linalg import expm
 
 from cg_dynamics.compiled import compile_model
-from cg_dynamics.effects import Effect
-from cg_dynamics.linearise import Linearisation, linearise, without_dry_friction
+from cg_dynamics.linearise import (
+    Linearisation,
+    linearise,
+    without_dry_friction,
+    without_extra_states,
+)
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
-FLEXIBLE, ROTOR, RIPPLE = 'joint_flexibility', 'rotor_inertia', 'cogging_torque'
 # They change what is commanded, read or met on the way, not how the bodies move.
 NOT_DESIGNED_ON = ('command', 'sensor', 'timing')
 
 
 def design_model(model: Model, elastic: bool = False) -> Model:
-    """The model without extra states, delays, sensor errors and dry friction.
+    """The model without extra states, delays, sensor errors, ripple and dry friction.
 
     Args:
         model: A compass gait.
@@ -34,32 +37,9 @@ def design_model(model: Model, elastic: bool = False) -> Model:
     """
     model = without_extra_states(without_dry_friction(model), elastic)
     for effect in model.effects:
-        if effect.name == RIPPLE or effect.place in NOT_DESIGNED_ON:
+        if effect.ripple or effect.place in NOT_DESIGNED_ON:
             model = model.without_effect(effect.label)
     return model
-
-
-def without_extra_states(model: Model, elastic: bool = False) -> Model:
-    """The model with the states of its coordinates alone; a rotor turns with the joint then.
-
-    Args:
-        model: Any model.
-        elastic: Keep the states of the transmission.
-    """
-    for effect in model.effects:
-        kept = elastic and effect.place == 'transmission' and not effect.extra_inputs
-        if (effect.states or effect.extra_inputs) and not kept:
-            rigid = model.without_effect(effect.label)
-            model = _with_rotor(model, rigid, effect) if effect.name == FLEXIBLE else rigid
-    return model
-
-
-def _with_rotor(model: Model, rigid: Model, flexible: Effect) -> Model:
-    inertia = model.values[f'{flexible.label}.rotor_inertia']
-    rotor = flexible.label.replace(FLEXIBLE, ROTOR)
-    if rotor in (effect.label for effect in rigid.effects):
-        return rigid.with_values({f'{rotor}.inertia': rigid.values[f'{rotor}.inertia'] + inertia})
-    return rigid.with_effect(ROTOR, flexible.at, inertia=inertia)
 
 
 def linearise_stance(

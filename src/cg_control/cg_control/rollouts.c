@@ -5,7 +5,7 @@
      prepare_s(p, c), rates_s(x, u, c, dx)      dx/dt, c what depends on parameters alone
      prepare_land_s(p, c), land_s(x, u, c, v)   rates (2) after the impact that ends stance s
    and, if COMPENSATE, of the known model:
-     prepare_taken(p, c), taken(rate, u, c, torque)
+     prepare_taken(p, c), taken(angle and rate of the hip, u, c, torque)
    and the sizes NX, NU, NP, NL (states that the law looks at), CONSTANTS, NK (parameters of the
    known model), and STILL of the law.
 
@@ -366,8 +366,8 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
                 law[i] = ((l.edge[3][i] * s + l.edge[2][i]) * s + l.edge[1][i]) * s + l.edge[0][i];
             vd torque = law[0];
 #if COMPENSATE
-            vd slip = l.x[2] - l.x[3], given;
-            taken(&slip, 0, friction, &given);
+            vd hip[2] = {l.x[0] - l.x[1], l.x[2] - l.x[3]}, given;
+            taken(hip, 0, friction, &given);
             torque += given;
 #endif
             vd feedback = SPLAT(0.0);

@@ -19,7 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from cg_control.friction import friction_torque
+from cg_control.friction import friction_parameters, friction_torque
 from cg_control.nodes import Nodes, triangles
 from cg_control.tracking import STILL, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
@@ -204,7 +204,7 @@ class _Work:
             'leg': _whole(nodes.stance), 'next': _whole(nodes.next),
             'landing': _whole(nodes.landing), 'late': np.ascontiguousarray(nodes.late),
             'span': np.ascontiguousarray(nodes.span), 'edge': nodes.edges,
-            'cost': nodes.forms, 'known': parameter_vector(known, Setup()),
+            'cost': nodes.forms, 'known': friction_parameters(known),
             'goal': forms, 'p': self.p, 'x': self.x, 'elapsed': self.elapsed, 'node': self.node,
             'stance': self.stance, 'samples': self.samples,
             'clock': _whole([name in CLOCKS for name in compiled.input_names]),
@@ -382,8 +382,8 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
             codes.append(code)
             constants = max(constants, shared + 1)
     if friction is not None:
-        rate, p, none = ca.SX.sym('w'), ca.SX.sym('p', friction.size1_in(1)), ca.SX.sym('u', 0)
-        taken = ca.Function('taken', [rate, none, p], [ca.densify(friction(rate, p))])
+        hip, p, none = ca.SX.sym('a', 2), ca.SX.sym('p', friction.size1_in(2)), ca.SX.sym('u', 0)
+        taken = ca.Function('taken', [hip, none, p], [ca.densify(friction(hip[0], hip[1], p))])
         code, shared = vector_code(taken, 'taken', 'prepare_taken')
         codes.append(code)
         constants = max(constants, shared + 1)
@@ -391,7 +391,7 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
         'WIDTH': WIDTH, 'NX': compiled[0].nx, 'NU': compiled[0].nu, 'NP': compiled[0].np,
         'NL': 2 * compiled[0].equations.coordinates, 'HYBRID': int(hybrid),
         'COMPENSATE': int(friction is not None),
-        'NK': 0 if friction is None else friction.size1_in(1), 'CONSTANTS': constants,
+        'NK': 0 if friction is None else friction.size1_in(2), 'CONSTANTS': constants,
         'STILL': STILL,
     }  # fmt: skip
     _sources[key] = '\n'.join([

@@ -148,7 +148,7 @@ class Tracker:
         reference = self._reference()
         wanted = reference.item(0)
         if self._friction:
-            wanted += self._friction.taken(x.item(2) - x.item(3))
+            wanted += self._friction.taken(x.item(0) - x.item(1), x.item(2) - x.item(3))
         if self.done or (self.settings.feedback and not self._blanked()):
             nx = self._nx
             wanted -= reference[1 + nx :].dot(x - reference[1 : 1 + nx]).item()

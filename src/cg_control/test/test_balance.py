@@ -178,22 +178,22 @@ def test_friction_is_what_the_simulation_takes():
         x = np.array([0.1, -0.1, rate / 2, -rate / 2])
         accelerations = [
             np.asarray(compile_model(m, setup).f(x, u, parameter_vector(m, setup))).ravel()[2:]
-            for m, u in ((MODEL, friction.taken(rate)), (bare, 0.0))
+            for m, u in ((MODEL, friction.taken(0.2, rate)), (bare, 0.0))
         ]
         np.testing.assert_allclose(accelerations[0], accelerations[1], atol=1e-10)
 
 
 def test_compensation_is_off_by_default_and_keeps_deadband_share_and_limit():
     friction = FrictionCompensation(MODEL)
-    assert friction.torque(1.0, FrictionSettings()) == 0.0
+    assert friction.torque(0.0, 1.0, FrictionSettings()) == 0.0
     on = FrictionSettings(
         friction_compensation=True, friction_share=0.8, friction_deadband=0.05, friction_limit=2.0
     )
-    assert friction.torque(0.05, on) == 0.0
-    assert friction.torque(0.075, on) == pytest.approx(0.5 * 0.8 * friction.taken(0.075))
+    assert friction.torque(0.0, 0.05, on) == 0.0
+    assert friction.torque(0.0, 0.075, on) == pytest.approx(0.5 * 0.8 * friction.taken(0.0, 0.075))
     # 1.84 + 0.694 rate N m passes 2 N m at 0.23 rad/s.
-    assert friction.torque(1.0, on) == pytest.approx(0.8 * 2.0)
-    assert friction.torque(-1.0, on) == pytest.approx(-0.8 * 2.0)
+    assert friction.torque(0.0, 1.0, on) == pytest.approx(0.8 * 2.0)
+    assert friction.torque(0.0, -1.0, on) == pytest.approx(-0.8 * 2.0)
 
 
 # Basins

@@ -64,12 +64,7 @@ class Equations:
 
 def acting_effects(model: Model) -> tuple[Effect, ...]:
     """The effects of a model that are not at their neutral value."""
-    values = model.values
-    return tuple(
-        effect
-        for effect in model.effects
-        if effect.acts({p.name: values[f'{effect.label}.{p.name}'] for p in effect.parameters})
-    )
+    return tuple(effect for effect in model.effects if effect.acts(model.values_of(effect)))
 
 
 def parameter_names(model: Model, setup: Setup) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ the form printed as Eq. 4.8 (which drops the derivatives of H^-1 and C) does not
 """
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -14,14 +15,9 @@ import numpy as np
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import CompiledModel, compile_model
+from cg_dynamics.effects import make_effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-
-# Friction whose slope at standstill is an artefact of its smoothing.
-DRY_FRICTION = (
-    'coulomb_friction', 'stribeck_friction', 'presliding_friction', 'load_dependent_friction',
-    'position_dependent_friction', 'asymmetric_friction', 'friction_drift', 'ankle_friction',
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,6 +78,32 @@ def linearise(model: Model, setup: Setup, x0: np.ndarray, u0: np.ndarray) -> Lin
 def without_dry_friction(model: Model) -> Model:
     """What a linear design may be made on: tanh(v / 0.01 rad/s) is no viscous friction."""
     for effect in model.effects:
-        if effect.name in DRY_FRICTION:
+        if effect.friction == 'dry':
             model = model.without_effect(effect.label)
     return model
+
+
+def without_extra_states(model: Model, elastic: bool = False) -> Model:
+    """The model with the states of its coordinates alone; a rotor turns with the joint then.
+
+    Args:
+        model: Any model.
+        elastic: Keep the states of the transmission.
+    """
+    for effect in model.effects:
+        if (effect.states or effect.extra_inputs) and not (elastic and effect.elastic):
+            left = effect.without_states(model.values_of(effect))
+            model = model.without_effect(effect.label)
+            for name, values in left.items():
+                model = _with_more(model, name, effect.site, values)
+    return model
+
+
+def _with_more(model: Model, name: str, site: str, values: Mapping[str, float]) -> Model:
+    """The model with an effect, or with more of it where it is there: what it scales with adds."""
+    effect = make_effect(name, model.mechanism, site)
+    if all(effect.label != other.label for other in model.effects):
+        return model.with_effect(name, site, **values)
+    first = effect.parameters[0].name
+    total = model.values[f'{effect.label}.{first}'] + values[first]
+    return model.with_values({f'{effect.label}.{first}': total})

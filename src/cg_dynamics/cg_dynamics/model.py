@@ -116,8 +116,9 @@ class Model:
                     _require(right, f'sensors.{channel}.{name}.value', q,
                              'a finite number of 0 or more' if name == 'noise'
                              else 'a positive finite number')
-            for channel, entries in file.actuators.items():
-                for name, q in entries.items():
+            for channel, unit in zip(body.inputs, body.input_units, strict=True):
+                for name, q in file.actuators.get(channel, {}).items():
+                    _same_unit(f'actuators.{channel}.{name}', q.unit, unit)
                     _require(q.value > 0, f'actuators.{channel}.{name}.value', q,
                              'a positive number')
         except ModelError as error:
@@ -186,7 +187,7 @@ class Model:
 
     @property
     def torque_limit(self) -> float:
-        """Smallest stated limit of the actuators in N m; infinite where none is stated."""
+        """Smallest stated limit of the actuators, in their unit; infinite if none is stated."""
         limits = [q['limit'].value for q in self.actuators.values() if 'limit' in q]
         return min(limits, default=float('inf'))
 
@@ -197,6 +198,11 @@ class Model:
                 return effect
         raise ModelError(f'model {self.name!r} has no effect {label!r}; it has: '
                          f'{", ".join(e.label for e in self.effects) or "none"}')
+
+    def values_of(self, effect: Effect) -> dict[str, float]:
+        """The values of one effect's own parameters, by their names within it."""
+        return {p.name: self.quantities[f'{effect.label}.{p.name}'].value
+                for p in effect.parameters}
 
     def with_effect(self, name: str, at: str | None = None, **values: float) -> 'Model':
         """This model and one more effect; parameters not given take their defaults."""

@@ -1,9 +1,19 @@
 """What a physical parameter is: the one place of its name, unit, range and neutral value."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cg_dynamics.errors import ModelError
+
+# Along a joint that slides an angle becomes a length: a torque a force, an inertia a mass.
+SLIDING = {'N m': 'N', 'kg m^2': 'kg', 'rad': 'm'}
+
+
+def sliding_unit(unit: str) -> str:
+    """What a unit of a joint that turns becomes along one that slides: N m s/rad is N s/m."""
+    for turning, sliding in SLIDING.items():
+        unit = unit.replace(turning, sliding)
+    return unit
 
 
 @dataclass(frozen=True)
@@ -12,7 +22,7 @@ class Parameter:
 
     Attributes:
         name: Name within its owner, e.g. 'stiffness'.
-        unit: SI unit, '1' for a ratio.
+        unit: SI unit, '1' for a ratio; of an effect, where it acts on a joint that turns.
         description: One phrase for people.
         lower: Smallest allowed value, in `unit`.
         upper: Largest allowed value, in `unit`.
@@ -30,6 +40,10 @@ class Parameter:
             Empty for a property of the machine.
         leeway: Of a parameter of shape, a device of the model: how far from its value the law of
             a real machine may lie, in `unit`, or as a logarithm where it is logarithmic.
+        along: Unit on a joint that slides where that is not `sliding_unit(unit)`: a phase stays
+            one.
+        smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn
+            it faster; a solver may start with a wider one.
     """
 
     name: str
@@ -45,6 +59,12 @@ class Parameter:
     swept: bool = False
     each: str = ''
     leeway: float = 0.0
+    along: str = ''
+    smoothing: bool = False
+
+    def sliding(self) -> 'Parameter':
+        """This declaration for a joint that slides."""
+        return replace(self, unit=self.along or sliding_unit(self.unit))
 
     @property
     def default(self) -> float:

@@ -7,7 +7,8 @@ import pytest
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.compiled import compile_model, simulate
 from cg_dynamics.contact import contact_law
-from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects import LIBRARY, UNMODELLED, make_effect
+from cg_dynamics.effects.unmodelled import LearnedEffect
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.rig import Setup
 
@@ -267,3 +268,31 @@ def test_sensor_errors_shift_their_channel_alone(bare, name, value, channel):
     expected = np.zeros(3)
     expected[channel] = 0.03
     np.testing.assert_allclose(shifted - plain, np.tile(expected, (len(TIME), 1)), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    'name', [n for n, e in (LIBRARY | UNMODELLED).items() if 'hip' in e.sites(COMPASS)]
+)
+def test_what_always_opposes_the_rate_is_declared_as_friction(name):
+    """Controllers ask the class: dry if it is as strong when slow, viscous if it fades."""
+    effect = make_effect(name, COMPASS)
+    p = {q.name: ca.SX(q.default) for q in effect.parameters}
+    p |= dict.fromkeys(effect.extra_inputs, ca.SX(1.0))
+    if isinstance(effect, LearnedEffect):
+        p |= {c: ca.SX(0.0) for c in effect.coefficients}
+        p[effect.coefficients[0]] = ca.SX(1.0)  # a constant, where there is one
+    x = ca.SX.sym('x', 3)
+    z = [ca.tanh(x[1] / 0.01)] * len(effect.states)  # bristles bent by a motion that lasts
+    torque, _ = effect.joint_torque(x[0], x[1], x[2], z, p)
+    law = ca.Function('law', [x], [torque])
+    rates = np.array([-2.0, -0.2, 0.2, 2.0])
+    power = np.array([
+        [float(law([angle, rate, load])) * rate for rate in rates]
+        for angle in (-0.7, 0.1, 0.4) for load in (-3.0, 3.0)
+    ])  # fmt: skip
+    opposes = (power <= 1e-12).all() and (power < -1e-12).any()
+    assert bool(effect.friction) == opposes
+    if opposes:
+        level = np.abs(power / rates).max(axis=0)
+        fast, slow = max(level[0], level[3]), max(level[1], level[2])
+        assert effect.friction == ('viscous' if slow < 0.5 * fast else 'dry')

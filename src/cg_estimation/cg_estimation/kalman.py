@@ -17,7 +17,12 @@ from scipy.linalg import expm, solve_discrete_are
 
 from cg_dynamics.compiled import CompiledModel
 from cg_dynamics.impact import impact_function
-from cg_dynamics.linearise import jacobians, linearise, without_dry_friction
+from cg_dynamics.linearise import (
+    jacobians,
+    linearise,
+    without_dry_friction,
+    without_extra_states,
+)
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import ModelEstimator, StampedEstimator
@@ -67,10 +72,8 @@ class SteadyKalmanFilter(StampedEstimator):
         use_gyro: bool = False,
         longest_gap: float = 0.1,
     ):
-        for effect in model.effects:
-            if effect.states or effect.extra_inputs:
-                model = model.without_effect(effect.label)
-        super().__init__(without_dry_friction(model), setup, longest_gap)
+        model = without_dry_friction(without_extra_states(model))
+        super().__init__(model, setup, longest_gap)
         self.sample_time, self.use_gyro = sample_time, use_gyro
         self._linear = {
             stance: linearise(self.model, _standing(self.setup, stance), np.zeros(4), np.zeros(1))

@@ -33,7 +33,7 @@ from cg_estimation.samples import Gatherer
 
 NOMINAL_MODEL = 'compass_gait_mit'
 LOADED = 0.5  # N, or the 1 of a plain switch
-ROTOR, ROTOR_STATE = 'hip_rotor', 'joint_flexibility.rotor_angle'
+ROTOR = 'hip_rotor'
 NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
 REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
 
@@ -59,14 +59,17 @@ class ObserverNode(Node):
         given = settings.model_file
         path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
         told = settings.stance == 'contacts'
+        model = Model.load(path)
         self.estimator = make_estimator(
-            settings, Model.load(path), Setup(stance='inner' if told else settings.stance)
+            settings, model, Setup(stance='inner' if told else settings.stance)
         )
         self.gatherer = Gatherer(contacts=told)
         # Other states of effects, of sensors say, are of no use to a controller.
         self._angles, self._rates = [0, 1], [2, 3]
-        if ROTOR_STATE in self.estimator.state_names:
-            rotor = self.estimator.state_names.index(ROTOR_STATE)
+        estimated = self.estimator.state_names
+        rotors = [f'{e.label}.{e.states[0]}' for e in model.effects if e.elastic]
+        if rotors and rotors[0] in estimated:
+            rotor = estimated.index(rotors[0])
             self._angles, self._rates = [0, 1, rotor], [2, 3, rotor + 1]
         self.message = JointState(name=[*STANCES, ROTOR][: len(self._angles)])
         self._published = 0

@@ -214,8 +214,8 @@ def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]
     expected = law.factor * step.size
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
-        yield Finding('zero_shift', 'error', torque.channel, f'jumps by {step.size:.3g} N m, '
-                      f'which {angle} does not answer', float(torque.time[step.sample - 1]),
+        yield Finding('zero_shift', 'error', torque.channel, f'jumps by {step.size:.3g} '
+                      f'{torque.unit}, which {angle} does not answer', float(torque.time[step.sample - 1]),
                       step.time, int(torque.sample[step.sample]), step.size,
                       MOVED * error / abs(law.factor))
 
@@ -242,6 +242,6 @@ def _clipped(
     if answered > ANSWERED * error and answered > CLIPPED * law.factor > 0:
         first, last = max(runs, key=lambda run: run[1] - run[0])
         yield Finding('sensor_clipping', 'error', torque, f'is recorded as no more than '
-                      f'{signal.values[first]:.4g} N m, but {angle} answers more',
+                      f'{signal.values[first]:.4g} {signal.unit}, but {angle} answers more',
                       float(signal.time[first]), float(signal.time[last]),
                       int(signal.sample[first]), answered / law.factor, CLIPPED)

@@ -47,6 +47,7 @@ class Signal:
         values: Samples, shape (M,).
         sample: Index of each sample within its topic, shape (M,).
         noise: Noise and resolution.
+        unit: Unit of the samples.
     """
 
     channel: str
@@ -55,6 +56,7 @@ class Signal:
     values: np.ndarray
     sample: np.ndarray
     noise: ChannelNoise
+    unit: str
 
 
 def read_signals(raw: RawRecording) -> dict[str, Signal]:
@@ -76,7 +78,10 @@ def read_signals(raw: RawRecording) -> dict[str, Signal]:
             noise = channel_noise(time, values[sample])
             if noise.quantum == 0.0:
                 noise = replace(noise, quantum=_quantum_of_pieces(values[sample]))
-            signals[channel] = Signal(channel, topic.name, time, values[sample], sample, noise)
+            unit = known.channel(channel).unit
+            signals[channel] = Signal(
+                channel, topic.name, time, values[sample], sample, noise, unit
+            )
     return signals
 
 
@@ -365,6 +370,6 @@ def _saturation(signal: Signal) -> Iterator[Finding]:
         return
     a, b = max(runs, key=lambda run: run[1] - run[0])
     yield Finding('saturation', 'warning', signal.channel,
-                  f'the torque runs along {signal.values[a]:.4g} N m for {share:.1%} of the '
-                  'samples', float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]),
+                  f'the torque runs along {signal.values[a]:.4g} {signal.unit} for {share:.1%} '
+                  'of the samples', float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]),
                   share, SATURATED_SHARE)

@@ -114,7 +114,8 @@ def _relations(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Rel
         law = fit_law(motion, torque, joint)
         if abs(law.factor) > CERTAIN * law.error and law.share > SHARE:
             yield _pair(torque, joint, law.factor > 0, f'{torque} drives {joint} up, and '
-                        f'accelerates it by {law.factor:.3g} rad/s^2 per N m')
+                        f'accelerates it by {law.factor:.3g} {signals[joint].unit}/s^2 per '
+                        f'{signals[torque].unit}')
 
 
 def _pair(first: str, second: str, same: bool, text: str) -> Relation:

@@ -200,6 +200,7 @@ def _head(form: str, verdict: str, summary: str, model: Model) -> Facts:
             )
         ],
         'inputs': list(model.mechanism.inputs),
+        'input_units': list(model.mechanism.input_units),
     }
 
 

@@ -71,7 +71,7 @@ def _pieces(curve: Curve, channel: int, unit: str) -> tuple[Any, ...] | None:
     window = max(5, 2 * int(0.5 * SMOOTHED_S / step) + 1)
     if len(grid) < 3 * window:
         return None
-    order = 1 if unit == 'rad/s' else 2
+    order = 1 if unit.endswith('/s') else 2
     acceleration = savgol_filter(error, window, 3, deriv=order, delta=step)
     inner = slice(window, -window)
     power = np.abs(np.fft.rfft(error * np.hanning(len(error)))) ** 2

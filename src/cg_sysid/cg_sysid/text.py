@@ -7,7 +7,7 @@ MINUS = '\u2212'
 THIN_SPACE = '\u202f'
 RAISED = str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹')
 # Units that are read more easily with a prefix when the value is small.
-PREFIXED = ('s', 'rad', 'rad/s')
+PREFIXED = ('s', 'rad', 'rad/s', 'm', 'm/s')
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -20,10 +20,10 @@ from cg_sysid.noise import measure_noise
 from cg_sysid.record import NS_PER_S, Record
 
 LATEST = 0.02  # s by which sensors may report late
-FASTEST = 50.0  # rad/s^2, acceleration of a lively start
+FASTEST = 50.0  # rad/s^2 or m/s^2, acceleration of a lively start
 START_WINDOW = 0.03  # s of data behind the first guess of the initial motion
 # A floor below the noise that is stated or measured would let rounding decide.
-SMALLEST_SIGMA = {'rad': 1e-6, 'rad/s': 1e-5}
+SMALLEST_SIGMA = {'rad': 1e-6, 'rad/s': 1e-5, 'm': 1e-6, 'm/s': 1e-5}
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def initial_motion(
         rows.append(matrix[j])
         values.append(coefficients[0])
         weights.append(1 / (sigma[j] * spread[0]))
-        if unit == 'rad':
+        if not unit.endswith('/s'):
             rows.append(np.concatenate([np.zeros(m), matrix[j, :m]]))
             values.append(coefficients[1])
             weights.append(1 / (sigma[j] * spread[1]))

@@ -146,7 +146,7 @@ def variable_words(effect: LearnedEffect) -> str:
     kind, _, of = effect.follows.partition(':')
     if isinstance(effect, SensorTerm):
         own = of == effect.site
-        if own and (kind == 'angle') == (effect.unit == 'rad'):
+        if own and (kind == 'angle') != effect.unit.endswith('/s'):
             return 'its own reading'
         return 'the rate of its reading' if own else of.replace('_', ' ')
     if kind == 'torque':

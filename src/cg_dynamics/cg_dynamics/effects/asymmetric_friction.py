@@ -15,6 +15,7 @@ class AsymmetricFriction(Effect):
 
     name = 'asymmetric_friction'
     place = 'joint'
+    friction = 'dry'
     summary = (
         'Dry friction is higher one way than the other: '
         '-excess max(0, tanh(rate / transition_rate)), on top of the Coulomb level.'

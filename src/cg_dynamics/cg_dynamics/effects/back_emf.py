@@ -9,6 +9,7 @@ class BackEmf(Effect):
 
     name = 'back_emf'
     place = 'joint'
+    friction = 'viscous'
     summary = (
         'A voltage drive damps the motor by its back-EMF, -coefficient rate (kt^2/R), but only '
         'while `drive_enabled` is 1.'

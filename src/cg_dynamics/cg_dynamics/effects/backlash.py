@@ -61,6 +61,10 @@ class Backlash(Effect):
         joint = p['stiffness'] * pressed + p['damping'] * touching * (w - rate)
         return joint, [w, (torque - joint) / p['rotor_inertia']]
 
+    def without_states(self, values):
+        """The rotor turns with the joint."""
+        return {'rotor_inertia': {'inertia': values['rotor_inertia']}}
+
     def initial_states(self, angle, rate, torque, p):
         """On the flank that the held torque presses on, moving with the joint."""
         side = ca.tanh(torque / 0.1)

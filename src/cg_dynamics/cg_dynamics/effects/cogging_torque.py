@@ -11,6 +11,7 @@ class CoggingTorque(Effect):
 
     name = 'cogging_torque'
     place = 'transmission'
+    ripple = True
     summary = (
         'Magnets or teeth pull the joint to certain angles: a torque '
         'amplitude sin(cycles angle + phase) adds to the motor torque.'
@@ -24,9 +25,11 @@ class CoggingTorque(Effect):
         Parameter(
             'cycles', '1', 'per revolution of the joint', 1.0, 400.0,
             starts=(12.0, 4.0, 6.0, 8.0, 10.0, *range(15, 64, 3)), scale=0.2, swept=True,
+            along='rad/m',
         ),
         Parameter(
-            'phase', 'rad', 'of the ripple at joint angle 0', -9.5, 9.5, starts=(0.0,), scale=0.1
+            'phase', 'rad', 'of the ripple at joint angle 0', -9.5, 9.5, starts=(0.0,), scale=0.1,
+            along='rad',
         ),
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ from cg_dynamics.parameter import Parameter
 TRANSITION_RATE = Parameter(
     'transition_rate', 'rad/s', 'rate over which the sign turns smoothly', 1e-4, 1.0,
     starts=(0.01,), scale=0.001, free=False, logarithmic=True,
-    leeway=log(2.5),
+    leeway=log(2.5), smoothing=True,
 )  # fmt: skip
 
 
@@ -19,6 +19,7 @@ class CoulombFriction(Effect):
 
     name = 'coulomb_friction'
     place = 'joint'
+    friction = 'dry'
     summary = 'Dry friction, smoothed: -torque tanh(rate / transition_rate) (Eq. 4.12).'
     parameters = (
         Parameter(

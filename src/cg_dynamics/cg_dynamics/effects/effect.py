@@ -123,6 +123,11 @@ class Effect:
             the same wave: fits report a positive amplitude and a phase within (-pi, pi].
         contains: Names of simpler effects that this one turns into at a limit of its parameters;
             where the simpler one explains the data as well, it is the one that is meant.
+        friction: How it opposes motion: 'dry' where the level does not fade with the rate, so that
+            the slope at standstill is only that of its smoothing; 'viscous' where it does; empty
+            where it does not.
+        ripple: True where its slope changes sign within small motions, so that the slope at one
+            state tells nothing of those around it.
         at: Joint, body or sensor where this instance acts; None where there is only one.
     """
 
@@ -136,6 +141,8 @@ class Effect:
     extra_inputs: ClassVar[tuple[str, ...]] = ()
     wave: ClassVar[tuple[str, str] | None] = None
     contains: ClassVar[tuple[str, ...]] = ()
+    friction: ClassVar[str] = ''
+    ripple: ClassVar[bool] = False
 
     def __init__(self, mechanism: Mechanism, at: str | None = None):
         sites = self.sites(mechanism)
@@ -148,6 +155,8 @@ class Effect:
             )
         self.site = sites[0] if at is None else at
         self.at = None if self.site == sites[0] else self.site
+        if self.slides(mechanism):
+            self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
 
     @property
     def label(self) -> str:
@@ -165,6 +174,30 @@ class Effect:
     def applies(cls, setups: Sequence[Setup]) -> bool:
         """False if no experiment in any of these set-ups could show the effect."""
         return True
+
+    @property
+    def elastic(self) -> bool:
+        """Whether a rotor turns apart from the joint, whose angle and rate are its states."""
+        return self.place == 'transmission' and bool(self.states) and not self.extra_inputs
+
+    def slides(self, mechanism: Mechanism) -> bool:
+        """Whether it acts along a line, so that its law is one of lengths and forces."""
+        return self.site in mechanism.joints and mechanism.slides(self.site)
+
+    def without_states(self, values: Mapping[str, float]) -> Mapping[str, Mapping[str, float]]:
+        """What is left of an effect with states where those may not count.
+
+        Args:
+            values: Of its own parameters.
+
+        Returns:
+            Effects at the same site, standard name -> parameters; empty if nothing is left.
+        """
+        return {}
+
+    def torque_limit(self, values: Mapping[str, float]) -> float:
+        """Largest torque in N m that it lets through, given its own parameters."""
+        return math.inf
 
     def acts(self, values: Mapping[str, float]) -> bool:
         """False if the first parameter has its neutral value, so that nothing happens at all."""
@@ -242,6 +275,10 @@ class SensorEffect(Effect):
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
         """The channels of the right kind."""
         return tuple(c for c, kind in mechanism.sensor_kinds.items() if kind == cls.kind)
+
+    def slides(self, mechanism: Mechanism) -> bool:
+        """Where the sensor reads a length."""
+        return mechanism.output_unit(self.site) in ('m', 'm/s')
 
 
 class ImuEffect(Effect):

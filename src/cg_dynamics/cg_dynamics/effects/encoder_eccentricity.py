@@ -26,6 +26,11 @@ class EncoderEccentricity(SensorEffect):
         ),
     )  # fmt: skip
 
+    @classmethod
+    def sites(cls, mechanism):
+        """Encoders with a disc: those of angles."""
+        return tuple(c for c in super().sites(mechanism) if mechanism.output_unit(c) == 'rad')
+
     def read(self, outputs, z, p):
         """Add the error of that angle."""
         angle = outputs[self.site]

@@ -42,6 +42,10 @@ class JointFlexibility(Effect):
         joint = p['stiffness'] * (a - angle) + p['damping'] * (w - rate)
         return joint, [w, (torque - joint) / p['rotor_inertia']]
 
+    def without_states(self, values):
+        """The rotor turns with the joint."""
+        return {'rotor_inertia': {'inertia': values['rotor_inertia']}}
+
     def initial_states(self, angle, rate, torque, p):
         """Wound up by the held torque, moving with the joint."""
         return [angle + torque / p['stiffness'], rate]

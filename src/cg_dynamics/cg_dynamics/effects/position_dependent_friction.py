@@ -14,6 +14,7 @@ class PositionDependentFriction(Effect):
 
     name = 'position_dependent_friction'
     place = 'joint'
+    friction = 'dry'
     summary = (
         'A bearing or gear that runs out of true rubs most at one angle: '
         '-torque (1 + cos(cycles angle - tightest))/2 tanh(rate / transition_rate).'
@@ -27,11 +28,12 @@ class PositionDependentFriction(Effect):
         ),
         Parameter(
             'tightest', 'rad', 'joint angle of most friction, times cycles', -9.5, 9.5,
-            starts=(1.5, -1.5, 0.0), scale=0.1,
+            starts=(1.5, -1.5, 0.0), scale=0.1, along='rad',
         ),
         Parameter(
             'cycles', '1', 'tight places in one turn', 0.2, 10.0,
             starts=(1.0,), scale=0.1, free=False, logarithmic=True, leeway=log(2.5),
+            along='rad/m',
         ),
         TRANSITION_RATE,
     )  # fmt: skip

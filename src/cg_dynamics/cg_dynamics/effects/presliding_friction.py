@@ -16,6 +16,7 @@ class PreslidingFriction(Effect):
 
     name = 'presliding_friction'
     place = 'joint'
+    friction = 'dry'
     summary = (
         'Dry friction that first yields like a spring (Dahl; LuGre with damping): '
         '-torque b - damping s, s = rate - |rate| b, db/dt = s / deflection.'
@@ -43,6 +44,10 @@ class PreslidingFriction(Effect):
         bent = z[0]
         bending = rate - ca.fabs(rate) * bent
         return -p['torque'] * bent - p['damping'] * bending, [bending / p['deflection']]
+
+    def without_states(self, values):
+        """The level to which the bristles bend."""
+        return {'coulomb_friction': {'torque': values['torque']}}
 
     def initial_states(self, angle, rate, torque, p):
         """Fully bent where the joint moves, relaxed where it rests."""

@@ -20,6 +20,7 @@ class StribeckFriction(Effect):
 
     name = 'stribeck_friction'
     place = 'joint'
+    friction = 'dry'
     summary = (
         'Dry friction that is higher near standstill and fades with rate: '
         '-torque exp(-|rate/stribeck_rate|^exponent) tanh(rate/transition_rate).'

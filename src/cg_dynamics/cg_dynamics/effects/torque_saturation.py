@@ -36,6 +36,10 @@ class TorqueSaturation(Effect):
         ),
     )  # fmt: skip
 
+    def torque_limit(self, values):
+        """The limit; a round knee comes near it for large torques only."""
+        return values['limit']
+
     def deliver(self, torque, z, p):
         """(KNEE), with the difference of the roots written as a sum."""
         r = p['roundness']

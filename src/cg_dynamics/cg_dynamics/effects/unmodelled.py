@@ -16,6 +16,7 @@ only where the library has failed. A name says what g is and what it follows, su
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -23,13 +24,14 @@ import casadi as ca
 from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
 from cg_dynamics.effects.effect import TIME, Body, Effect, Symbols, reading_rate
 from cg_dynamics.mechanisms.mechanism import Mechanism
-from cg_dynamics.parameter import Parameter
+from cg_dynamics.parameter import Parameter, sliding_unit
 
 COSINES = 32  # the shortest half wave is a thirtieth of the range
 HARMONICS = 4
 VIBRATING_HARMONICS = 2
 LARGEST = 1e4  # of a coefficient, in its unit
 UNITS = {'angle': 'rad', 'rate': 'rad/s', 'torque': 'N m', 'time': 's', 'body_angle': 'rad'}
+OPPOSING = {'friction': 'dry', 'damping': 'viscous'}
 
 
 class LearnedEffect(Effect):
@@ -38,7 +40,7 @@ class LearnedEffect(Effect):
     Attributes:
         variable: What g is a function of, a key of `UNITS`; `body_angle` is the angle of a
             coordinate that is not the joint's own, which the site names after a colon.
-        unit: Of g.
+        unit: Of g, at a joint that turns; of an instance, where it acts.
         kind: The law: smooth, periodic or vibrating.
         coefficients: Names of the parameters in which g is linear.
     """
@@ -47,6 +49,21 @@ class LearnedEffect(Effect):
     unit: ClassVar[str]
     kind: ClassVar[str]
     coefficients: ClassVar[tuple[str, ...]]
+
+    def __init__(self, mechanism: Mechanism, at: str | None = None):
+        super().__init__(mechanism, at)
+        if self.slides(mechanism):
+            self.unit = sliding_unit(self.unit)  # type: ignore[misc]
+        followed = self._followed_unit(mechanism)
+        self.parameters = tuple(  # type: ignore[misc]
+            replace(p, unit=followed) if p.name in ('low', 'high', 'period') else p
+            for p in self.parameters
+        )
+
+    def _followed_unit(self, mechanism: Mechanism) -> str:
+        """Unit of the variable."""
+        unit = UNITS[self.variable]
+        return sliding_unit(unit) if self.slides(mechanism) else unit
 
     def acts(self, values: Mapping[str, float]) -> bool:
         """Always: the zero function does nothing, but a fit sets out from it."""
@@ -90,6 +107,16 @@ class JointTerm(LearnedEffect):
 
     place = 'joint'
     carrier: ClassVar[str]
+
+    def slides(self, mechanism: Mechanism) -> bool:
+        """As the joint does, whatever the function follows."""
+        return mechanism.slides(self.site.partition(':')[0])
+
+    def _followed_unit(self, mechanism: Mechanism) -> str:
+        _, _, other = self.site.partition(':')
+        if not other:
+            return super()._followed_unit(mechanism)
+        return 'm' if other in mechanism.sliding else 'rad'
 
     @classmethod
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
@@ -158,16 +185,29 @@ class SensorTerm(LearnedEffect):
         if self.variable == 'torque':
             self.extra_inputs = (self._other,)  # type: ignore[misc]
 
+    def slides(self, mechanism: Mechanism) -> bool:
+        """Where the sensor reads a length or its rate."""
+        return mechanism.output_unit(self.site.partition(':')[0]) in ('m', 'm/s')
+
+    def _followed_unit(self, mechanism: Mechanism) -> str:
+        if self.variable == 'torque':
+            return dict(zip(mechanism.inputs, mechanism.input_units, strict=True))[self._other]
+        if self.variable == 'angle' and self._other:
+            return mechanism.output_unit(self._other)
+        return super()._followed_unit(mechanism)
+
     @classmethod
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
         """Channels of that unit; with a colon, the reading or torque that the error follows."""
-        units = dict(zip(mechanism.outputs, mechanism.output_units, strict=True))
-        own = [channel for channel, unit in units.items() if unit == cls.unit]
+        def reading(unit: str) -> tuple[str, ...]:
+            alike = (unit, sliding_unit(unit))
+            units = zip(mechanism.outputs, mechanism.output_units, strict=True)
+            return tuple(channel for channel, of in units if of in alike)
+
+        own = reading(cls.unit)
         if cls.variable in ('time', 'rate'):
-            return tuple(own)
-        followed = mechanism.inputs if cls.variable == 'torque' else tuple(
-            channel for channel, unit in units.items() if unit == UNITS[cls.variable]
-        )
+            return own
+        followed = mechanism.inputs if cls.variable == 'torque' else reading(UNITS[cls.variable])
         return tuple(c if c == f else f'{c}:{f}' for c in own for f in followed)
 
     @property
@@ -179,7 +219,7 @@ class SensorTerm(LearnedEffect):
         channel = self.site.partition(':')[0]
         if self.variable in ('torque', 'time'):
             s = p[self._other or TIME]
-        elif self.variable == 'rate' and self.unit == 'rad':
+        elif self.variable == 'rate' and not self.unit.endswith('/s'):
             s = p[reading_rate(channel)]
         else:
             s = outputs[self._other or channel]
@@ -280,6 +320,8 @@ def _define() -> dict[str, type[LearnedEffect]]:
                     'kind': kind,
                     'coefficients': _coefficients(kind),
                     'carrier': carrier,
+                    'friction': OPPOSING.get(carrier, ''),
+                    'ripple': what == 'joint_torque' and kind == 'periodic',
                     'parameters': (
                         (*parameters, TRANSITION_RATE) if carrier == 'friction' else parameters
                     ),

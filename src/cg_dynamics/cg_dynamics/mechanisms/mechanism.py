@@ -34,12 +34,14 @@ class Mechanism(ABC):
         coordinates: Names of the full coordinates q.
         joints: Actuated joint -> row B_j with joint angle = B_j q; a torque on the joint is the
             generalised force B_j' tau.
-        inputs: Input channels, one per actuated joint in the order of `joints`.
+        inputs: Input channels, one per actuated joint in the order of `joints`: torques,
+            or forces along joints that slide.
         outputs: Output channels, in order.
         output_units: Unit of each output channel.
         sensor_kinds: Output channel -> 'encoder', 'inclinometer' or 'gyro'.
         bodies: Bodies that a payload or a spring can be tied to.
         parameters: Declared parameters.
+        sliding: Coordinates that are lengths in m; the others are angles in rad.
     """
 
     name: str
@@ -51,6 +53,22 @@ class Mechanism(ABC):
     sensor_kinds: Mapping[str, str]
     bodies: tuple[str, ...]
     parameters: tuple[Parameter, ...]
+    sliding: tuple[str, ...] = ()
+
+    def slides(self, joint: str) -> bool:
+        """Whether a joint moves along a line: its position is in m, what acts on it in N."""
+        row = self.joints[joint]
+        return any(share and q in self.sliding
+                   for q, share in zip(self.coordinates, row, strict=True))
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Unit of each input: N m on a joint that turns, N on one that slides."""
+        return tuple('N' if self.slides(joint) else 'N m' for joint in self.joints)
+
+    def output_unit(self, channel: str) -> str:
+        """Unit of an output channel."""
+        return self.output_units[self.outputs.index(channel)]
 
     @abstractmethod
     def energies(

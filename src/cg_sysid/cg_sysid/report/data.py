@@ -1,7 +1,7 @@
 """Last part of the page: recordings, their quality, and where everything comes from."""
 
 from cg_sysid.report.markup import Markup, tag
-from cg_sysid.report.wording import Facts, setup_words
+from cg_sysid.report.wording import Facts, input_units, setup_words
 from cg_sysid.text import effect_name, listed, number, plain_unit, scaled
 
 ROLES = {'held': 'held out', 'train': 'fitted', 'all': 'fitted'}
@@ -55,10 +55,10 @@ def _error(error: Facts | None, unit: str) -> str:
 
 
 def _covers(facts: Facts, record: Facts) -> list[Markup]:
-    units = {c['name']: c['unit'] for c in facts['channels']}
+    units = {c['name']: c['unit'] for c in facts['channels']} | input_units(facts)
     return [
         tag('span', f'{name} {number(low, 2)} to {number(high, 2)} '
-            f'{plain_unit(units.get(name, "N m"))}', tag('br'))
+            f'{plain_unit(units.get(name, ""))}', tag('br'))
         for name, (low, high) in record['coverage'].items()
     ]  # fmt: skip
 

@@ -62,7 +62,7 @@
   // --- words --------------------------------------------------------------------------------
   function scaled(largest, unit) {
     if (unit === '1') return [1, ''];
-    if (['rad', 'rad/s', 's'].indexOf(unit) >= 0) {
+    if (['rad', 'rad/s', 's', 'm', 'm/s'].indexOf(unit) >= 0) {
       if (largest < 1e-4) return [1e6, '\u00b5' + unit];
       if (largest < 0.0995) return [1e3, 'm' + unit];
     }
@@ -326,11 +326,14 @@
         y: { lo: -top, hi: top, label: 'residual in ' + unit } }));
 
       const inputs = r.inputs.slice(0, data.inputs.length).map(decoded);
+      const pushes = data.input_units.map((of) => of === 'N' ? 'force' : 'torque');
+      const driven = pushes.map((what, i) => what + ' in ' + data.input_units[i])
+        .filter((text, i, all) => all.indexOf(text) === i).join(', ');
       y = padded(extent(inputs, from, to), 0.08, 0.1);
-      drawn.push(chart(hosts[2], { height: 122, title: 'torque',
+      drawn.push(chart(hosts[2], { height: 122, title: pushes[0],
         x: { lo: x.lo, hi: x.hi, label: 'time in s' },
         lines: inputs.map((v, i) => ({ x: t, y: v, cls: 'torque' + i })),
-        y: { lo: y[0], hi: y[1], label: 'torque in N m' } }));
+        y: { lo: y[0], hi: y[1], label: driven } }));
       drawn.forEach((d, i) => interactive(d, i, t, measured, sim, inputs, channel));
     }
 
@@ -357,7 +360,8 @@
         readout.textContent = 't ' + t[i].toFixed(3) + ' s   measured ' + short(measured[i]) + b +
           '   ' + (both ? 'after ' : 'simulated ') + short(sim.after[i]) + ' ' +
           (channel.unit === '1' ? '' : channel.unit) +
-          inputs.map((v) => '   torque ' + short(v[i]) + ' N m').join('');
+          inputs.map((v, k) => '   ' + (data.input_units[k] === 'N' ? 'force ' : 'torque ') +
+            short(v[i]) + ' ' + data.input_units[k]).join('');
         if (start !== null) {
           mark.setAttribute('x', Math.min(start, p));
           mark.setAttribute('width', Math.abs(p - start));

@@ -1,7 +1,7 @@
 """Signals made small enough to live in a page: quantised curves, spectra, residuals by state."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from scipy.signal import welch
 
 from cg_sysid.curves import Curve
 from cg_sysid.faults import FaultSignal
+from cg_sysid.report.wording import input_units
 
 MISSING = 0xFFFF
 STEPS = 0xFFFE
@@ -37,6 +38,7 @@ def payload(
     return {
         'channels': channels,
         'inputs': facts['inputs'],
+        'input_units': list(input_units(facts).values()),
         'thinned': every,
         'faults': [_fault(signal) for signal in faults],
         'records': [_record(curve, every) for curve in shown],
@@ -45,7 +47,7 @@ def payload(
             for j, channel in enumerate(channels)
         },
         'states': {
-            channel['name']: by_state(judged, j, facts['inputs'])
+            channel['name']: by_state(judged, j, channel['unit'], input_units(facts))
             for j, channel in enumerate(channels)
         },
     }
@@ -147,14 +149,24 @@ def _regular(curve: Curve, channel: int) -> tuple[float, np.ndarray, np.ndarray]
     return step, both[0], both[1]
 
 
-def by_state(curves: Sequence[Curve], channel: int, inputs: Sequence[str]) -> list[Facts]:
-    """Residual before and after against angle, rate and torque: mean and spread in bins."""
+def by_state(
+    curves: Sequence[Curve], channel: int, unit: str, inputs: Mapping[str, str]
+) -> list[Facts]:
+    """Residual before and after against angle, rate and torque: mean and spread in bins.
+
+    Args:
+        curves: Records as simulated.
+        channel: Index of the output.
+        unit: Its unit.
+        inputs: Unit of each input.
+    """
+    moved = unit.removesuffix('/s')
     axes = [
-        ('angle', 'rad', [c.position[:, channel] for c in curves]),
-        ('rate', 'rad/s', [c.rate[:, channel] for c in curves]),
+        ('angle' if moved == 'rad' else 'position', moved, [c.position[:, channel] for c in curves]),
+        ('rate', f'{moved}/s', [c.rate[:, channel] for c in curves]),
     ]
-    for i, name in enumerate(inputs):
-        axes.append((name.replace('_', ' '), 'N m', [c.inputs[:, i] for c in curves]))
+    for i, (name, of) in enumerate(inputs.items()):
+        axes.append((name.replace('_', ' '), of, [c.inputs[:, i] for c in curves]))
     found = []
     for name, unit, values in axes:
         if not values:

@@ -28,6 +28,12 @@ FIXTURES = {
 }  # fmt: skip
 
 
+def input_units(facts: Facts) -> dict[str, str]:
+    """Unit of each input; files that say none are of joints that turn."""
+    inputs = facts['inputs']
+    return dict(zip(inputs, facts.get('input_units') or ['N m'] * len(inputs), strict=True))
+
+
 def headline(facts: Facts) -> str:
     """The verdict in a few words."""
     verdict, causes = facts['verdict'], facts['causes']
