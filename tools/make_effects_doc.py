@@ -71,8 +71,9 @@ def section(effect, mechanisms) -> list[str]:
         starts = ', '.join(map(number, p.starts)) or '-'
         neutral = '-' if p.neutral is None else number(p.neutral)
         free = 'yes' if p.free else 'shape' if p.leeway else 'choice' if p.choice else 'no'
+        unit = f'{p.unit} ({p.along})' if p.along else p.unit
         lines.append(
-            f'| `{p.name}` | {p.unit}{f" ({p.along})" if p.along else ""} | {p.description} | {number(p.lower)} to {number(p.upper)} '
+            f'| `{p.name}` | {unit} | {p.description} | {number(p.lower)} to {number(p.upper)} '
             f'| {neutral} | {starts} | {free} |'
         )
     return [*lines, '']
@@ -98,9 +99,9 @@ def page() -> str:
         '"choice" one that stays at that of its starts which explains most. A new effect is '
         'one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
         '',
-        'Units are those of a joint that turns. At a joint that slides, and in a sensor that reads '
-        f'a length, {sliding}: friction in N m s/rad is one in N s/m there. Where that is not '
-        'so, the unit at such a joint is in brackets.',
+        'Units are those of a joint that turns. At a joint that slides, and in a sensor that '
+        f'reads a length, {sliding}: friction in N m s/rad is one in N s/m there. Where that is '
+        'not so, the unit at such a joint is in brackets.',
         '',
     ]
     for place, words in PLACES.items():

@@ -139,8 +139,8 @@ def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     for name in moving if raw.note.get('initial_state') == 'rest' else ():
         rate = begins[name][1]
         yield Finding('not_at_rest', 'warning', name, f'the note says that the motion starts from '
-                      f'rest, but this moves at {rate:.3g} {signals[name].unit}/s', 0.0, START_S, 0, rate,
-                      REST_RATE)
+                      f'rest, but this moves at {rate:.3g} {signals[name].unit}/s', 0.0, START_S,
+                      0, rate, REST_RATE)
     free = raw.mechanism == 'compass_gait' and raw.setup.fixture == 'none'
     if free and not raw.setup.springs and 'imu_angle' in begins and not moving:
         lean = begins['imu_angle'][0] - (
@@ -209,7 +209,8 @@ def _excitation(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
         low, high = (float(frequency[np.searchsorted(share, q)]) for q in (0.05, 0.95))
         rms = float(np.sqrt(np.mean(signal.values**2)))
         yield Finding('excitation', 'info', name, f'rms {rms:.4g} {signal.unit}, '
-                      f'peak {peak:.4g} {signal.unit}, 90 % of the power in {low:.3g} .. {high:.3g} Hz',
+                      f'peak {peak:.4g} {signal.unit}, 90 % of the power in {low:.3g} .. '
+                      f'{high:.3g} Hz',
                       value=[rms, peak, low, high])
 
 

@@ -215,8 +215,9 @@ def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
         yield Finding('zero_shift', 'error', torque.channel, f'jumps by {step.size:.3g} '
-                      f'{torque.unit}, which {angle} does not answer', float(torque.time[step.sample - 1]),
-                      step.time, int(torque.sample[step.sample]), step.size,
+                      f'{torque.unit}, which {angle} does not answer',
+                      float(torque.time[step.sample - 1]), step.time,
+                      int(torque.sample[step.sample]), step.size,
                       MOVED * error / abs(law.factor))
 
 

@@ -371,5 +371,5 @@ def _saturation(signal: Signal) -> Iterator[Finding]:
     a, b = max(runs, key=lambda run: run[1] - run[0])
     yield Finding('saturation', 'warning', signal.channel,
                   f'the torque runs along {signal.values[a]:.4g} {signal.unit} for {share:.1%} '
-                  'of the samples', float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]),
-                  share, SATURATED_SHARE)
+                  'of the samples', float(signal.time[a]), float(signal.time[b]),
+                  int(signal.sample[a]), share, SATURATED_SHARE)

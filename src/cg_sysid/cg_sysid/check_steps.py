@@ -52,16 +52,17 @@ def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
         together = _others_jump(step, signal, clean)
         if _mirrored(step):
             yield Finding('sign_error', 'error', name, f'jumps from {step.before:.4g} to '
-                          f'{step.after:.4g} {signal.unit} and goes on with the opposite sign', *place,
-                          step.after, step.before)
+                          f'{step.after:.4g} {signal.unit} and goes on with the opposite sign',
+                          *place, step.after, step.before)
         elif missing or together:
             time = f'{1e3 * missing:.3g} ms are' if missing else 'time is'
             yield Finding('dropped_samples', 'error', signal.topic, f'{name} jumps by '
-                          f'{step.size:.4g} {signal.unit}: {time} missing in the stamps, which show no gap',
-                          *place, missing or None, 0.0)
+                          f'{step.size:.4g} {signal.unit}: {time} missing in the stamps, which '
+                          'show no gap', *place, missing or None, 0.0)
         else:
-            yield Finding('zero_shift', 'error', name, f'jumps by {step.size:.4g} {signal.unit} from '
-                          'one sample to the next and stays there', *place, step.size, step.limit)
+            yield Finding('zero_shift', 'error', name, f'jumps by {step.size:.4g} {signal.unit} '
+                          'from one sample to the next and stays there', *place, step.size,
+                          step.limit)
 
 
 def _mirrored(step: Step) -> bool:

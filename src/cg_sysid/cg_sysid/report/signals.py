@@ -161,8 +161,9 @@ def by_state(
         inputs: Unit of each input.
     """
     moved = unit.removesuffix('/s')
+    what = 'angle' if moved == 'rad' else 'position'
     axes = [
-        ('angle' if moved == 'rad' else 'position', moved, [c.position[:, channel] for c in curves]),
+        (what, moved, [c.position[:, channel] for c in curves]),
         ('rate', f'{moved}/s', [c.rate[:, channel] for c in curves]),
     ]
     for i, (name, of) in enumerate(inputs.items()):
