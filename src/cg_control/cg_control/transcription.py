@@ -17,19 +17,23 @@ in time linear in n: the state of a stage is its knot (x, a, u) and T, its contr
     s+ = (w, T),   g(s, w) = 0  or within bounds.                                    (OCP)
 
 Each stage enters Jacobian and Hessian of the Lagrangian as one dense block; the blocks come from
-one symbolic expression per mode, mapped over the stages, generated to C and cached.
+one symbolic expression per mode, mapped over the stages. Nearly all of the generated C is in them,
+and they know nothing of how many intervals there are or what else the program consists of: each is
+compiled once, for coarse, fine and elastic programs alike, and linked.
 """
 
 import functools
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import acting_effects, assemble, parameter_names
-from cg_dynamics.c_compiler import FLAGS, compiler, shared_library
+from cg_dynamics.c_compiler import FLAGS, compiler, object_file, shared_library
 from cg_dynamics.hybrid import other
 from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms.compass_gait import CompassGait
@@ -99,6 +103,8 @@ Row = tuple[str, Any, float, float]
 class Block:
     """The rows of one kind of stage: f(s, w, p), where s is the state and w the control.
 
+    Here p is that of the program and, last, the number of intervals of the phase.
+
     Attributes:
         function: (z, p) -> rows, cost; z = (s, w).
         jacobian: (z, p) -> d rows/dz, dense.
@@ -116,6 +122,82 @@ class Block:
     lower: np.ndarray
     upper: np.ndarray
     names: tuple[str, ...]
+
+    @property
+    def functions(self) -> tuple[ca.Function, ...]:
+        """Rows, Jacobian, Hessian and gradient."""
+        return self.function, self.jacobian, self.hessian, self.gradient
+
+    def compiled(self) -> tuple['Block', Path]:
+        """The block as machine code, from the cache if it is known, and its object file."""
+        name = self.function.name().removesuffix('_f')  # what is linked together needs its own
+        generator = ca.CodeGenerator(name, {'with_header': False})
+        for function in self.functions:
+            generator.add(function)
+        code = object_file(generator.dump(), FLAGS_HERE)
+        library = str(shared_library('', FLAGS_HERE, [code]))
+        f, j, h, g = (ca.external(function.name(), library) for function in self.functions)
+        return replace(self, function=f, jacobian=j, hessian=h, gradient=g), code
+
+    def and_start(self, start: 'Block') -> 'Block':
+        """This stage with rows of its state alone besides."""
+        z, p = ca.MX.sym('z', self.function.size1_in(0)), ca.MX.sym('p', self.function.size1_in(1))
+        factor, multipliers = ca.MX.sym('factor'), ca.MX.sym('lam', len((*self.names, *start.names)))
+        nx, own = start.function.size1_in(0), len(self.names)
+        controls = z.shape[0] - nx
+        state = z[:nx]
+        rows, cost = self.function(z, p)
+        beside = ca.DM.zeros(len(start.names), controls)
+        jacobian = ca.vertcat(
+            self.jacobian(z, p), ca.horzcat(start.jacobian(state, p), beside)
+        )
+        bent = start.hessian(state, p, factor, multipliers[own:])
+        hessian = self.hessian(z, p, factor, multipliers[:own]) + ca.diagcat(
+            bent, ca.DM.zeros(controls, controls)
+        )
+        return Block(
+            ca.Function('first_f', [z, p], [ca.vertcat(rows, start.function(state, p)[0]), cost]),
+            ca.Function('first_j', [z, p], [jacobian]),
+            ca.Function('first_h', [z, p, factor, multipliers], [ca.densify(hessian)]),
+            self.gradient,
+            np.concatenate([self.lower, start.lower]),
+            np.concatenate([self.upper, start.upper]),
+            (*self.names, *start.names),
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """Stages of one kind in a row.
+
+    Attributes:
+        block: Their rows.
+        count: How many they are.
+        kind: 'knot' where dynamics to the next stage are s+ = (w, T), 'jump' or 'last'.
+        intervals: Of the phase.
+        start: Rows besides, of the state alone.
+    """
+
+    block: Block
+    count: int
+    kind: str
+    intervals: int
+    start: Block | None = None
+
+    @property
+    def whole(self) -> Block:
+        """All rows of a stage."""
+        return self.block.and_start(self.start) if self.start else self.block
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """What it is made of."""
+        return (self.block, self.start) if self.start else (self.block,)
+
+    def of(self, made: dict[str, Block]) -> 'Run':
+        """The same run of other functions, by the name of what they stand for."""
+        start = self.start and made[self.start.function.name()]
+        return replace(self, block=made[self.block.function.name()], start=start)
 
 
 def _block(name: str, z: ca.SX, p: ca.SX, rows: list[Row], cost) -> Block:
@@ -164,14 +246,14 @@ class Transcription:
         self.model_parameters = len(parameter_names(model, Setup()))
         goal = GOAL_PARAMETERS['region' if structure.region else 'box']
         self.parameter_count = self.model_parameters + len(TASK_PARAMETERS) + goal
-        self._symbols = ca.SX.sym('p', self.parameter_count)
+        self._symbols = ca.SX.sym('p', self.parameter_count + 1)
         self._model = model
         self._build()
 
     # Symbols
 
     def _parameters(self) -> tuple[ca.SX, dict[str, ca.SX]]:
-        task = self._symbols[self.model_parameters :]
+        task = self._symbols[self.model_parameters : -1]
         self._goal = task[len(TASK_PARAMETERS) :]
         named = dict(
             zip(TASK_PARAMETERS, ca.vertsplit(task[: len(TASK_PARAMETERS)]), strict=True)
@@ -203,14 +285,14 @@ class Transcription:
         height = l * (ca.cos(q[st]) - ca.cos(q[sw])) + reach * tangent
         return height, ca.jtimes(height, q, v), reach
 
-    def _stage(self, mode: str, n: int, first: bool) -> Block:
+    def _stage(self, mode: str) -> Block:
         scaled = ca.SX.sym('z', self.nx + KNOT)
         s, w = self._physical(scaled[: self.nx]), ca.DM(UNITS) * scaled[self.nx :]
         p, task = self._parameters()
         dynamics = self._inverse_dynamics(mode)
         x, a, u, T = s[:4], s[4:6], s[6], s[7]
         x_next, a_next, u_next = w[:4], w[4:6], w[6]
-        h = T / n
+        h = T / self._symbols[-1]
         x_c = (x + x_next) / 2 + h / 8 * (
             ca.vertcat(x[2:], a) - ca.vertcat(x_next[2:], a_next)
         )
@@ -221,10 +303,6 @@ class Transcription:
             ('collocation', dynamics(x_c, a_c, (u + u_next) / 2, p), 0.0, 0.0),
             ('dynamics', dynamics(x_next, a_next, u_next, p), 0.0, 0.0),
         ]
-        if first:
-            rows.append(('dynamics', dynamics(x, a, u, p), 0.0, 0.0))
-            if self.memory:
-                rows.append(('memory', (s[8:] - x) / MEMORY_UNITS, 0.0, 0.0))
         if self.structure.rate_limited:
             rows.append(('rate', (u_next - u) / h / RATE_SCALE, np.nan, np.nan))
         if self.structure.clearance:
@@ -235,8 +313,18 @@ class Transcription:
             rows.append(('clearance', room * 10, 0.0, np.inf))
         effort = h / 2 * (u**2 + u_next**2)
         cost = task['effort'] * effort + task['time'] * h
-        kind = 'first' if first else 'stage'
-        return _block(f'{kind}_{mode}', scaled, self._symbols, rows, cost)
+        return _block(f'stage_{mode}', scaled, self._symbols, rows, cost)
+
+    def _start(self, mode: str) -> Block:
+        """What the first knot must keep besides: nothing before it does."""
+        scaled = ca.SX.sym('z', self.nx)
+        s, (p, _) = self._physical(scaled), self._parameters()
+        rows: list[Row] = [
+            ('dynamics', self._inverse_dynamics(mode)(s[:4], s[4:6], s[6], p), 0.0, 0.0)
+        ]
+        if self.memory:
+            rows.append(('memory', (s[8:] - s[:4]) / MEMORY_UNITS, 0.0, 0.0))
+        return _block(f'start_{mode}', scaled, self._symbols, rows, 0)
 
     def _landing(self, s: ca.SX, mode: str):
         q, v = ca.SX.sym('q', 2), ca.SX.sym('v', 2)
@@ -303,24 +391,24 @@ class Transcription:
 
     def _build(self) -> None:
         s = self.structure
-        # (block, stages in a row, has dynamics to the next stage that are s+ = (w, T))
-        runs: list[tuple[Block, int, str]] = []
+        stages = {mode: self._stage(mode) for mode in dict.fromkeys(s.modes)}
+        jumps = {mode: self._jump(mode) for mode in dict.fromkeys(s.modes[:-1])}
+        runs: list[Run] = []
         for i, (mode, n) in enumerate(zip(s.modes, s.intervals, strict=True)):
             if i == 0:
-                runs.append((self._stage(mode, n, True), 1, 'knot'))
-                runs.append((self._stage(mode, n, False), n - 1, 'knot'))
-            else:
-                runs.append((self._stage(mode, n, False), n, 'knot'))
+                runs.append(Run(stages[mode], 1, 'knot', n, self._start(mode)))
+            runs.append(Run(stages[mode], n - 1 if i == 0 else n, 'knot', n))
             if i < len(s.modes) - 1:
-                runs.append((self._jump(mode), 1, 'jump'))
+                runs.append(Run(jumps[mode], 1, 'jump', n))
             else:
-                runs.append((self._last(mode), 1, 'last'))
+                runs.append(Run(self._last(mode), 1, 'last', n))
         self._runs = runs
         self._nx, self._nu, self._ng = [], [], []
         lower: list[float] = []
         upper: list[float] = []
         names: list[str] = []
-        for block, count, kind in runs:
+        for run in runs:
+            block, count, kind = run.whole, run.count, run.kind
             gap = 0 if kind == 'last' else self.nx
             controls = block.function.size1_in(0) - self.nx
             own = len(block.names) - (gap if kind == 'jump' else 0)
@@ -341,9 +429,8 @@ class Transcription:
         sizes = np.add(self._nx, self._nu)
         self.offsets = np.concatenate([[0], np.cumsum(sizes)])
         self.size = int(self.offsets[-1])
-        self._functions = self._assembled()
 
-    def _assembled(self) -> list[ca.Function]:
+    def _assembled(self, runs: Sequence[Run]) -> list[ca.Function]:
         """The functions of the program: f, g, gradient, Jacobian, Hessian, under their names."""
         z: Any = ca.MX.sym('x', self.size)
         p: Any = ca.MX.sym('p', self.parameter_count)
@@ -360,16 +447,17 @@ class Transcription:
         cols_h: list[np.ndarray] = []
         constants: list[tuple[int, int, float]] = []
         column, row = 0, 0
-        for block, count, kind in self._runs:
+        for run in runs:
+            block, count, kind = run.whole, run.count, run.kind
             width, own = block.function.size1_in(0), len(block.names)
             fill = self.nx if kind == 'knot' else 0
             height = fill + own
             Z = ca.reshape(z[column : column + count * width], width, count)
             L = ca.reshape(lam_g[row : row + count * height], height, count)[fill:, :]
-            P = ca.repmat(p, 1, count)
+            P = ca.repmat(ca.vertcat(p, run.intervals), 1, count)
             mapped = [
                 fn if count == 1 else fn.map(count)
-                for fn in (block.function, block.jacobian, block.hessian, block.gradient)
+                for fn in block.functions
             ]
             values, cost = mapped[0](Z, P)
             f += ca.sum2(cost)
@@ -442,7 +530,7 @@ class Transcription:
 
     def functions(self) -> dict[str, ca.Function]:
         """The functions of the program by name, interpreted: for tests."""
-        return {function.name(): function for function in self._functions}
+        return {function.name(): function for function in self._assembled(self._runs)}
 
     @functools.cached_property
     def _program(self) -> Any:
@@ -450,12 +538,16 @@ class Transcription:
         if compiler() is None:
             log.warning('no C compiler found: planning runs on the CasADi virtual machine, slower')
             z, p = ca.MX.sym('x', self.size), ca.MX.sym('p', self.parameter_count)
-            f, g = self._functions[0](z, p)
+            f, g = self._assembled(self._runs)[0](z, p)
             return {'x': z, 'p': p, 'f': f, 'g': g}
+        made, objects = {}, []
+        for name, block in {b.function.name(): b for run in self._runs for b in run.blocks}.items():
+            made[name], code = block.compiled()
+            objects.append(code)
         generator = ca.CodeGenerator('cgt', {'with_header': False})
-        for function in self._functions:
+        for function in self._assembled([run.of(made) for run in self._runs]):
             generator.add(function)
-        return str(shared_library(generator.dump(), FLAGS_HERE))
+        return str(shared_library(generator.dump(), FLAGS_HERE, objects))
 
     def solver(self, iterations: int, tolerance: float, points: bytes = b'') -> ca.Function:
         """Fatrop on the compiled program.
