@@ -10,7 +10,7 @@ from cg_sysid.diagnosis import Options
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.rehearse import rehearse
 
-DURATION = 4.0
+DURATION, SAMPLE = 3.0, 0.004  # s; the ringing has 20 samples in a turn
 MACHINES = {
     # A harmonic drive that rings at some 11 Hz, and a drive electronics that is late.
     'joint_flexibility': {'stiffness': 260.0, 'rotor_inertia': 0.09, 'damping': 0.6},
@@ -47,7 +47,7 @@ def hidden(request, model_file):
         )
         records.append(
             rehearse(f'record_{k}', machine, setup, start, [make_signal(settings)], DURATION,
-                     seed=40 + k)
+                     SAMPLE, seed=40 + k)
         )  # fmt: skip
     return request.param, nominal, records
 

@@ -15,6 +15,8 @@ from cg_dynamics.model import Model
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 
+SHORT = 4.0  # s, two thirds of what the bench records
+
 
 @pytest.fixture(scope='module')
 def nominal(model_file):
@@ -28,7 +30,7 @@ def test_none_of_them_is_in_the_library():
 @pytest.mark.parametrize('case', CASES, ids=lambda c: c.hidden.name)
 def test_unlisted_effect_is_described(nominal, case):
     answer = diagnose(
-        nominal, records(hide(nominal, case.hidden)), Options(effects=case.listed, workers=1)
+        nominal, records(hide(nominal, case.hidden), duration=SHORT), Options(effects=case.listed, workers=1)
     )
     assert answer.verdict == 'unexplained', answer.summary
     found = answer.unmodelled
@@ -55,7 +57,7 @@ def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
     answer = diagnose(
-        nominal, records(hide(nominal, case.hidden)), Options(effects=case.listed, workers=1)
+        nominal, records(hide(nominal, case.hidden), duration=SHORT), Options(effects=case.listed, workers=1)
     )
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
@@ -73,7 +75,7 @@ def test_described_where_a_sensor_was_not_recorded(nominal):
     machine = hide(nominal, SoftStop)
     seen = [
         replace(r, outputs={c: y for c, y in r.outputs.items() if c != 'imu_rate'})
-        for r in records(machine)
+        for r in records(machine, duration=SHORT)
     ]
     answer = diagnose(nominal, seen, Options(effects=('ground_slope', 'payload'), workers=1))
     assert answer.verdict == 'unexplained', answer.summary

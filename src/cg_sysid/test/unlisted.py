@@ -335,14 +335,14 @@ def hide(nominal, hidden):
     return replace(machine, effects=(*machine.effects, hidden(machine.mechanism)))
 
 
-def records(machine, seed=0):
+def records(machine, seed=0, duration=DURATION):
     found = []
     for k, (setup, start) in enumerate(SETUPS):
         settings = ExcitationSettings(
-            amplitude=6.0, f_min=0.1, f_max=2.5, duration=DURATION, seed=10 * seed + k
+            amplitude=6.0, f_min=0.1, f_max=2.5, duration=duration, seed=10 * seed + k
         )
         found.append(
-            rehearse(f'record_{k}', machine, setup, start, [make_signal(settings)], DURATION,
+            rehearse(f'record_{k}', machine, setup, start, [make_signal(settings)], duration,
                      SAMPLE, 10 * seed + k)
         )  # fmt: skip
     return found
