@@ -142,8 +142,8 @@ class Block:
     def and_start(self, start: 'Block') -> 'Block':
         """This stage with rows of its state alone besides."""
         z, p = ca.MX.sym('z', self.function.size1_in(0)), ca.MX.sym('p', self.function.size1_in(1))
-        factor, multipliers = ca.MX.sym('factor'), ca.MX.sym('lam', len((*self.names, *start.names)))
         nx, own = start.function.size1_in(0), len(self.names)
+        factor, multipliers = ca.MX.sym('factor'), ca.MX.sym('lam', own + len(start.names))
         controls = z.shape[0] - nx
         state = z[:nx]
         rows, cost = self.function(z, p)
@@ -541,7 +541,8 @@ class Transcription:
             f, g = self._assembled(self._runs)[0](z, p)
             return {'x': z, 'p': p, 'f': f, 'g': g}
         made, objects = {}, []
-        for name, block in {b.function.name(): b for run in self._runs for b in run.blocks}.items():
+        blocks = {b.function.name(): b for run in self._runs for b in run.blocks}
+        for name, block in blocks.items():
             made[name], code = block.compiled()
             objects.append(code)
         generator = ca.CodeGenerator('cgt', {'with_header': False})

@@ -29,9 +29,8 @@ def test_none_of_them_is_in_the_library():
 
 @pytest.mark.parametrize('case', CASES, ids=lambda c: c.hidden.name)
 def test_unlisted_effect_is_described(nominal, case):
-    answer = diagnose(
-        nominal, records(hide(nominal, case.hidden), duration=SHORT), Options(effects=case.listed, workers=1)
-    )
+    made = records(hide(nominal, case.hidden), duration=SHORT)
+    answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     found = answer.unmodelled
     assert found is not None, answer.summary
@@ -56,9 +55,8 @@ def test_unlisted_effect_is_described(nominal, case):
 def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
-    answer = diagnose(
-        nominal, records(hide(nominal, case.hidden), duration=SHORT), Options(effects=case.listed, workers=1)
-    )
+    made = records(hide(nominal, case.hidden), duration=SHORT)
+    answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
     (cause,) = answer.causes
