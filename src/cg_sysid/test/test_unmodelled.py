@@ -8,7 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from unlisted import CASES, MORE, SoftStop, ViscoelasticHip, hide, records
+from unlisted import (
+    CASES,
+    DURATION,
+    MORE,
+    SoftStop,
+    TiltedGyro,
+    ViscoelasticHip,
+    hide,
+    records,
+)
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
@@ -29,7 +38,9 @@ def test_none_of_them_is_in_the_library():
 
 @pytest.mark.parametrize('case', CASES, ids=lambda c: c.hidden.name)
 def test_unlisted_effect_is_described(nominal, case):
-    made = records(hide(nominal, case.hidden), duration=SHORT)
+    # Gravity in a gyroscope is small beside its noise: its shape takes all that the bench records.
+    long = case.hidden is TiltedGyro
+    made = records(hide(nominal, case.hidden), duration=DURATION if long else SHORT)
     answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     found = answer.unmodelled
@@ -55,7 +66,7 @@ def test_unlisted_effect_is_described(nominal, case):
 def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
-    made = records(hide(nominal, case.hidden), duration=SHORT)
+    made = records(hide(nominal, case.hidden))
     answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
