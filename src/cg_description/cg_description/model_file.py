@@ -54,7 +54,7 @@ SENSOR = Mapping({
 })  # fmt: skip
 ACTUATOR = Mapping({
     'limit': Key(QUANTITY, 'largest torque either way; the drive clips to it, controllers and '
-                 'planner stay below it', default=None, unit='N m'),
+                 'planner stay below it', default=None, unit='N m; N along a rail'),
 })  # fmt: skip
 SCHEMA = Mapping({
     'format': Key(Text((FORMAT,)), 'form of the file'),

@@ -86,9 +86,9 @@ def test_the_file_holds_the_units_of_the_rail():
     assert again.quantities['viscous_friction.coefficient'].unit == 'N s/m'
     assert model.with_effect('quadratic_friction').quantities[
         'quadratic_friction.coefficient'].unit == 'N s^2/m^2'  # fmt: skip
-    with pytest.raises(ModelError, match="unit is 'N m s/rad', expected 'N s/m'"):
+    with pytest.raises(ModelError, match=r"coefficient.unit: 'N m s/rad' is not 'N s/m'"):
         Model.from_text(FILE.replace('N s/m', 'N m s/rad'))
-    with pytest.raises(ModelError, match=r"actuators.force.limit: unit is 'N m', expected 'N'"):
+    with pytest.raises(ModelError, match=r"actuators.force.limit.unit: 'N m' is not 'N'"):
         Model.from_text(FILE.replace('value: 20.0, unit: N', 'value: 20.0, unit: N m'))
 
 
