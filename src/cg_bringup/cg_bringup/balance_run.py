@@ -142,8 +142,8 @@ def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_bringup balance`."""
     default = BalanceOptions()
     parser = argparse.ArgumentParser(prog='balance', description=__doc__)
-    parser.add_argument('--robot', default=default.robot, help='model file of the machine')
-    parser.add_argument('--model', default='', help='model file of observer and controller')
+    parser.add_argument('--robot', default=default.robot, help='simulated: a model file or a name')
+    parser.add_argument('--model', default='', help='of observer and controller: the same')
     parser.add_argument('--stance', choices=STANCES, default='inner', help='[inner]')
     parser.add_argument('--lean', type=float, default=LEAN, help=f'at the start, rad [{LEAN}]')
     parser.add_argument('--mode', choices=MODES, default='real_time', help='[real_time]')

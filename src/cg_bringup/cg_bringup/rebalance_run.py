@@ -94,8 +94,8 @@ def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_bringup rebalance`."""
     default = RebalanceOptions()
     parser = argparse.ArgumentParser(prog='rebalance', description=__doc__)
-    parser.add_argument('--robot', default=default.robot, help='model file of the machine')
-    parser.add_argument('--model', default='', help='model file of observer and controller')
+    parser.add_argument('--robot', default=default.robot, help='simulated: a model file or a name')
+    parser.add_argument('--model', default='', help='of observer and controller: the same')
     parser.add_argument('--first', choices=STANCES, default='inner', help='[inner]')
     parser.add_argument('--remedy', choices=REMEDIES, default='event', help='[event]')
     parser.add_argument(

@@ -47,7 +47,7 @@ class Run:
     Attributes:
         experiment: What is done.
         bag: Where it is recorded.
-        model_file: Model of the simulated machine; None for the nominal one.
+        model_file: Model of the simulated machine, by path or name; None for the nominal one.
         note_model_file: Model that the recording note names; None for model_file.
         seed: Of the sensor noise and of the excitation: other seeds are other records.
         mode: 'lockstep' or 'real_time'.
@@ -74,7 +74,7 @@ class Run:
     @property
     def model_path(self) -> Path:
         """File of the simulated machine's model."""
-        return self.model_file or model_path(NOMINAL_MODEL)
+        return model_path(self.model_file or NOMINAL_MODEL)
 
 
 def experiment_nodes(run: Run) -> dict[str, NodeOf]:

@@ -19,8 +19,8 @@ from cg_dynamics.rig import STANCES
 
 DEFAULT = BalanceOptions()
 ARGUMENTS = {
-    'robot': (DEFAULT.robot, 'model file of the simulated machine', None),
-    'model': ('', 'model file of observer and controller; empty for the nominal one', None),
+    'robot': (DEFAULT.robot, 'model of the simulated robot: a file or a name', None),
+    'model': ('', 'model of observer and controller, a file or a name; empty: nominal', None),
     'stance': ('inner', 'leg that stands', list(STANCES)),
     'lean': (str(DEFAULT.lean), 'of both legs at the start, rad', None),
     'mode': ('real_time', 'clock of the machine', list(MODES)),

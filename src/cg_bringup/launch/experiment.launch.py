@@ -12,12 +12,13 @@ from launch import LaunchDescription
 
 from cg_bringup.launching import description, node_actions, number
 from cg_bringup.runs import MODES, Run, experiment_nodes
+from cg_description.paths import model_path
 from cg_sysid.experiments import experiment_names, load_experiment
 
 ARGUMENTS = {
     'experiment': ('spring_stabilised_inner', 'what to carry out', experiment_names()),
     'bag': ('', 'bag directory to write; empty for bags/<experiment>_seed<seed>', None),
-    'model': ('', 'model file of the simulated machine; empty for the nominal one', None),
+    'model': ('', 'model of the simulated robot, a file or a name; empty: nominal', None),
     'seed': ('1', 'seed of sensor noise and excitation', None),
     'mode': ('real_time', 'clock of the machine', list(MODES)),
     'duration': ('0', 'length in s; 0 for that of the experiment', None),
@@ -31,7 +32,7 @@ def start(given: dict[str, str]) -> list:
     run = Run(
         experiment,
         bag=Path(bag).expanduser().resolve(),
-        model_file=Path(given['model']).expanduser().resolve() if given['model'] else None,
+        model_file=model_path(given['model']).resolve() if given['model'] else None,
         seed=number(given, 'seed', int),
         mode=given['mode'],
         duration=number(given, 'duration') or None,

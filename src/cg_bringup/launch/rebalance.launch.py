@@ -19,8 +19,8 @@ from cg_dynamics.rig import STANCES
 
 DEFAULT = RebalanceOptions()
 ARGUMENTS = {
-    'robot': (DEFAULT.robot, 'model file of the simulated machine', None),
-    'model': ('', 'model file of observer, planner and controller; empty: nominal', None),
+    'robot': (DEFAULT.robot, 'model of the simulated robot: a file or a name', None),
+    'model': ('', 'model of observer, planner and controller; empty: nominal', None),
     'first': ('inner', 'leg that stands at the start', list(STANCES)),
     'remedy': ('event', 'what is done about an impact off its time', list(REMEDIES)),
     'friction': ('true', 'plan with friction; otherwise compensate it', ['true', 'false']),

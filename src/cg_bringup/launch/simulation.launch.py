@@ -13,7 +13,7 @@ from cg_bringup.launching import description, node_actions, number
 from cg_bringup.runs import MODES, NodeOf
 
 ARGUMENTS = {
-    'model': ('', 'model file to simulate; empty for the nominal compass gait', None),
+    'model': ('', 'model to simulate, a file or a name; empty: the nominal compass gait', None),
     'setup': ('', 'what was done to the rig: YAML text or a file', None),
     'mode': ('real_time', 'clock of the machine', list(MODES)),
     'seed': ('0', 'seed of the sensor noise', None),

@@ -27,7 +27,6 @@ from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tvlqr import Weights, stabilise
 from cg_description.model_file import write_atomically
-from cg_description.paths import model_path
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
@@ -167,14 +166,14 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
 def main(args: list[str] | None = None) -> int:
     """Search the weights of the one-step rebalance."""
     parser = argparse.ArgumentParser(prog='python -m cg_control.cost_tuning', description=__doc__)
-    parser.add_argument('--model', default='', help='model file; empty for the nominal one')
+    parser.add_argument('--model', default='', help='file or name; empty for the nominal one')
     parser.add_argument('--first', choices=STANCES, default='inner', help='leg of the start')
     parser.add_argument('--rounds', type=int, default=30, help='sets of weights to try [30]')
     parser.add_argument('--starts', type=int, default=60, help='starts of each [60]')
     parser.add_argument('--seed', type=int, default=0, help='[0]')
     parser.add_argument('--out', type=Path, default=Path('tuning'), help='directory [tuning]')
     options = parser.parse_args(args)
-    robot = Model.load(options.model or model_path('compass_gait_mit'))
+    robot = Model.load(options.model or 'compass_gait_mit')
     second = next(leg for leg in STANCES if leg != options.first)
     trajectory = plan(robot, Task((options.first, second), reach=0.2), Options(fine=25))
     deviations = starts(options.starts, options.first, options.seed)

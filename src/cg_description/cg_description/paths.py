@@ -1,4 +1,4 @@
-"""Where the installed model files are."""
+"""Where model files are: those that come along, by name, and any other by its path."""
 
 from pathlib import Path
 
@@ -18,11 +18,28 @@ def models_directory() -> Path:
     raise ModelFileError(f'no models directory beside or above {package}')
 
 
-def model_path(name: str) -> Path:
-    """Path of the model file called name, e.g. 'compass_gait_mit'."""
-    directory = models_directory()
-    path = directory / f'{name}.yaml'
-    if not path.is_file():
-        known = ', '.join(sorted(p.stem for p in directory.glob('*.yaml')))
-        raise ModelFileError(f'no model called {name!r}; there are: {known}')
-    return path
+def model_path(name: str | Path) -> Path:
+    """The model file that is meant: one that comes along, by its name, or any other by its path.
+
+    Args:
+        name: A path, `~` included, or a name such as 'compass_gait_mit'. A file of that name in
+            the working directory comes first.
+
+    Raises:
+        ModelFileError: There is neither; with the path that was tried and the names there are.
+    """
+    path = Path(name).expanduser()
+    if path.exists() and not path.is_dir():
+        return path
+    shipped = models_directory() / f'{name}.yaml'
+    if shipped.parent == models_directory() and shipped.is_file():
+        return shipped
+    raise ModelFileError(
+        f'no model {str(name)!r}: there is no file {path.absolute()}, and those that come along '
+        f'are called {", ".join(model_names())}'
+    )
+
+
+def model_names() -> list[str]:
+    """Names of the model files that come along."""
+    return sorted(path.stem for path in models_directory().glob('*.yaml'))

@@ -15,7 +15,7 @@ from cg_description.model_file import (
     sha256,
     write_atomically,
 )
-from cg_description.paths import model_path, models_directory
+from cg_description.paths import models_directory
 
 MINIMAL = """
 format: cg_model/1
@@ -90,11 +90,6 @@ def test_exponents_need_neither_point_nor_sign():
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(ModelFileError, match=r'none\.yaml: cannot be read: No such file'):
         load(tmp_path / 'none.yaml')
-
-
-def test_unknown_model_lists_those_there_are():
-    with pytest.raises(ModelFileError, match=r"no model called 'none'; there are: .*compass_gait"):
-        model_path('none')
 
 
 def test_file_is_whole_or_not_there(tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from cg_description.model_file import (
     sha256,
     write_atomically,
 )
+from cg_description.paths import model_path
 from cg_description.reading import shown
 from cg_description.schema import meant
 from cg_dynamics.effects import LIBRARY, Effect, make_effect
@@ -82,9 +83,13 @@ class Model:
     def load(cls, path: str | Path) -> 'Model':
         """Read a model file.
 
+        Args:
+            path: Path of the file, or the name of one that comes along ('compass_gait_mit').
+
         Raises:
             ModelFileError, ModelError: naming the file, the entry and what is allowed there.
         """
+        path = model_path(path)
         return cls.from_file(load(path), str(path))
 
     @classmethod

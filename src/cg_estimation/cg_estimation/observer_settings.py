@@ -24,7 +24,9 @@ METHODS = (
 class ObserverSettings(Settings):
     """Parameters of an estimator."""
 
-    model_file: str = setting('', 'model file to observe with; empty for the nominal compass gait')
+    model_file: str = setting(
+        '', 'model to observe with, a file or a name; empty for the nominal compass gait'
+    )
     method: str = setting('high_gain', 'what estimates the state', choices=METHODS)
     epsilon: float = setting(
         0.2,

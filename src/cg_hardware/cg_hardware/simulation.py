@@ -26,7 +26,9 @@ LOCKSTEP_EPOCH_NS = NANOSECONDS  # simulated time starts at 1 s: a stamp of zero
 class SimulationSettings(Settings):
     """Parameters of the simulation node."""
 
-    model_file: str = setting('', 'model file to simulate; empty for the nominal compass gait')
+    model_file: str = setting(
+        '', 'model to simulate, a file or a name; empty for the nominal compass gait'
+    )
     setup: str = setting('', 'what was done to the rig: YAML text, or a file that holds it')
     seed: int = setting(0, 'seed of the sensor noise', minimum=0)
     sample_rate_hz: float = setting(
@@ -127,9 +129,9 @@ class SimulationSettings(Settings):
         )
 
 
-def model_file_of(path: str) -> Path:
-    """The model file to use; empty means the nominal compass gait."""
-    return Path(path).expanduser() if path else model_path(NOMINAL_MODEL)
+def model_file_of(name: str) -> Path:
+    """The model file to use, by path or name; empty means the nominal compass gait."""
+    return model_path(name or NOMINAL_MODEL)
 
 
 def read_setup(text: str) -> Setup:
