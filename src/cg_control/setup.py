@@ -1,9 +1,19 @@
 from glob import glob
+from importlib.util import find_spec
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'cg_control'
+
+# Only where they can run: colcon builds in the shell's environment, where ROS 2 is, pip in one of
+# its own, where rclpy is never found.
+NODES = [
+    'balance_node = cg_control.balance_node:main',
+    'playback_node = cg_control.playback_node:main',
+    'trajectory_server_node = cg_control.trajectory_server_node:main',
+    'tvlqr_node = cg_control.tvlqr_node:main',
+]
 
 
 def shared(*folders):
@@ -39,11 +49,8 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'balance_node = cg_control.balance_node:main',
+            *(NODES if find_spec('rclpy') else []),
             'cost_tuning = cg_control.cost_tuning:main',
-            'playback_node = cg_control.playback_node:main',
-            'trajectory_server_node = cg_control.trajectory_server_node:main',
-            'tvlqr_node = cg_control.tvlqr_node:main',
         ],
     },
 )

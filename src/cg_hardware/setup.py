@@ -1,9 +1,17 @@
 from glob import glob
+from importlib.util import find_spec
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'cg_hardware'
+
+# Only where they can run: colcon builds in the shell's environment, where ROS 2 is, pip in one of
+# its own, where rclpy is never found.
+NODES = [
+    'simulation_node = cg_hardware.simulation_node:main',
+    'safety_gate_node = cg_hardware.safety_gate_node:main',
+]
 
 
 def shared(*folders):
@@ -36,9 +44,6 @@ setup(
     extras_require={'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
     entry_points={
-        'console_scripts': [
-            'simulation_node = cg_hardware.simulation_node:main',
-            'safety_gate_node = cg_hardware.safety_gate_node:main',
-        ],
+        'console_scripts': NODES if find_spec('rclpy') else [],
     },
 )

@@ -1,9 +1,32 @@
+import sys
 from glob import glob
+from importlib.util import find_spec
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'cg_sysid'
+
+# colcon calls `setup.py develop` or `setup.py install`, in the shell's environment, and setup.cfg
+# sends executables to lib/cg_sysid, where only `ros2 run` looks and a name such as `import` is
+# nobody else's. pip makes a wheel, whose executables go to bin, for all to see, and does so in an
+# environment of its own, in which rclpy is never found, whatever the shell has sourced.
+TO_OWN_FOLDER = not {'develop', 'install'}.isdisjoint(sys.argv)
+PROGRAMS = [
+    'recover = cg_sysid.recover:main',
+    'import = cg_sysid.importing:main',
+    'check = cg_sysid.check:main',
+    'identify = cg_sysid.identify_cli:main',
+    'diagnose = cg_sysid.diagnose_cli:main',
+    'report = cg_sysid.report_cli:main',
+    'rehearse = cg_sysid.rehearse_cli:main',
+    'new_model = cg_sysid.new_model:main',
+    'frequency_response = cg_sysid.frequency_response:main',
+]
+NODES = [
+    'excitation_node = cg_sysid.excitation_node:main',
+    'recorder_node = cg_sysid.recorder_node:main',
+]
 
 
 def shared(*folders):
@@ -44,15 +67,9 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'excitation_node = cg_sysid.excitation_node:main',
-            'recorder_node = cg_sysid.recorder_node:main',
-            'recover = cg_sysid.recover:main',
-            'import = cg_sysid.importing:main',
-            'check = cg_sysid.check:main',
-            'identify = cg_sysid.identify_cli:main',
-            'diagnose = cg_sysid.diagnose_cli:main',
-            'report = cg_sysid.report_cli:main',
-            'frequency_response = cg_sysid.frequency_response:main',
+            'cg = cg_sysid.command:main',
+            *(PROGRAMS if TO_OWN_FOLDER else []),
+            *(NODES if TO_OWN_FOLDER and find_spec('rclpy') else []),
         ],
     },
 )
