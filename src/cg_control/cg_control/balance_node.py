@@ -7,6 +7,9 @@ next state, and their basin follows (live_design.py): no parameter delays an ans
 
 It also watches the loop: the age of the measurement when the drive latched the torque that answers
 it, and how many deadlines of `deadline` were missed, on /diagnostics.
+
+in    /state, /applied_torque
+out   /torque_command, /diagnostics
 """
 
 import collections
@@ -39,7 +42,9 @@ ROTOR = 'hip_rotor'
 class BalanceNodeSettings(BalanceSettings):
     """Parameters of the balance node."""
 
-    model_file: str = setting('', 'model file to design on; empty for the nominal compass gait')
+    model_file: str = setting(
+        '', 'model to design on, a file or a name; empty for the nominal compass gait'
+    )
     elastic: bool = setting(
         False, 'design on the transmission too; the observer must have the same model'
     )
@@ -201,7 +206,7 @@ class BalanceNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_control balance_node`."""
-    return run(BalanceNode, args)
+    return run(BalanceNode, BalanceNodeSettings, args)
 
 
 if __name__ == '__main__':

@@ -3,6 +3,9 @@
 Each measurement is answered by the torque of its stamp: the first one after a motion came on
 /trajectory is its time zero. Before, after, and when an empty motion stops it, the torque is zero.
 No state is looked at: keep the robot from falling.
+
+in    /imu (its stamps), /trajectory
+out   /torque_command
 """
 
 from dataclasses import dataclass
@@ -109,7 +112,7 @@ class PlaybackNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_control playback_node`."""
-    return run(PlaybackNode, args)
+    return run(PlaybackNode, PlaybackSettings, args)
 
 
 if __name__ == '__main__':

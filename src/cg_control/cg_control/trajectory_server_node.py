@@ -36,7 +36,9 @@ PLANNED = {'inner_to_outer': ('inner', 'outer'), 'outer_to_inner': ('outer', 'in
 class ServerSettings(Settings):
     """Parameters of the trajectory server."""
 
-    model_file: str = setting('', 'model file to plan for; empty for the nominal compass gait')
+    model_file: str = setting(
+        '', 'model to plan for, a file or a name; empty for the nominal compass gait'
+    )
     trajectory: str = setting(
         'inner_to_outer',
         f'what is selected: {", ".join(PLANNED)} (planned), or a trajectory file',
@@ -159,7 +161,7 @@ def joint_trajectory(trajectory: Trajectory) -> JointTrajectory:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_control trajectory_server_node`."""
-    return run(TrajectoryServerNode, args)
+    return run(TrajectoryServerNode, ServerSettings, args)
 
 
 if __name__ == '__main__':

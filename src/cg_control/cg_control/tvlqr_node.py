@@ -4,6 +4,9 @@ Until a trajectory is started it balances; then it follows the trajectory, and b
 on which that ends. What it follows is the text on /trajectory/selected; when, is said by
 /trajectory: a motion starts, an empty one stops. Every state is answered by the command of its
 stamp, zero torque included, so that the same node works in real time and in lock-step.
+
+in    /state, /trajectory, /trajectory/selected
+out   /torque_command, /diagnostics
 """
 
 import dataclasses
@@ -46,7 +49,9 @@ GAP = 0.02  # s between states after which the one before is history
 class TvlqrNodeSettings(ExecutionSettings):
     """Parameters of the TVLQR node."""
 
-    model_file: str = setting('', 'model file of the robot; empty for the nominal compass gait')
+    model_file: str = setting(
+        '', 'model of the robot, a file or a name; empty for the nominal compass gait'
+    )
     sample_rate_hz: float = setting(
         500.0, 'rate of the states', unit='Hz', minimum=10.0, maximum=2000.0
     )
@@ -217,7 +222,7 @@ def state_of(message: JointState) -> tuple[str, np.ndarray]:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_control tvlqr_node`."""
-    return run(TvlqrNode, args)
+    return run(TvlqrNode, TvlqrNodeSettings, args)
 
 
 if __name__ == '__main__':

@@ -13,10 +13,12 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
 """
 
 import dataclasses
+import inspect
 import sys
 import time
 import typing
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -34,8 +36,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
-from cg_dynamics.settings import Settings, describe
+from cg_dynamics.settings import Settings, describe, table
 from cg_dynamics.stop_request import StopRequest, end_at_once, end_with_parent
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -48,6 +51,7 @@ LATCHED_QOS = QoSProfile(
 )
 IDLE_POLL = 0.05  # s
 FAREWELL = 0.3  # s that listeners are given to receive the last words of a node
+EXECUTABLE = 'node'  # rcl expects the name of the program first
 LARGEST_DOUBLE = sys.float_info.max
 LARGEST_INTEGER = 2**63 - 1
 
@@ -181,13 +185,32 @@ class Throttled:
             self._log(message)
 
 
-def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
+def run(
+    make_node: Callable[[], Node], settings: type[Settings], args: list[str] | None = None
+) -> int:
     """Make a node and spin it until it is told to stop (stop_request.py) or has `finished`.
 
+    Args:
+        make_node: The class of the node.
+        settings: What it declares, for `--help`.
+        args: Of the command line; those of this process if None.
+
     Returns:
-        Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for settings
-        that are refused.
+        Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for arguments
+        or settings that are refused.
     """
+    given = sys.argv[1:] if args is None else args
+    if not {'-h', '--help'}.isdisjoint(given):
+        print(usage(make_node, settings))
+        return 0
+    strangers = remove_ros_args([EXECUTABLE, *given])[1:]
+    if strangers:
+        print(
+            f'error: unknown argument {strangers[0]!r}; parameters are given by '
+            '--ros-args -p NAME:=VALUE (--help lists them)',
+            file=sys.stderr,
+        )
+        return 2
     # Until the node stands it has sent nothing: there is nothing that it must leave in order.
     end_at_once()
     end_with_parent()
@@ -221,6 +244,19 @@ def _see_off(node: Node) -> None:
     for publisher in node.publishers:
         left = max(0.0, deadline - time.monotonic())
         publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+def usage(make_node: Callable[[], Node], settings: type[Settings]) -> str:
+    """What `--help` says: the text at the head of the node's module, and its parameters."""
+    package, _, executable = make_node.__module__.partition('.')
+    if make_node.__module__ == '__main__':
+        executable = Path(sys.argv[0]).stem
+    text = inspect.cleandoc(sys.modules[make_node.__module__].__doc__ or '')
+    return '\n'.join([
+        f'usage: {executable or package} [--ros-args [-p PARAMETER:=VALUE] [-r TOPIC:=OTHER] ...]',
+        '', text, '',
+        'parameters [default], * may change while the node is at work:', table(settings),
+    ])  # fmt: skip
 
 
 def spin(node: Node, stopped: Callable[[], bool]) -> None:

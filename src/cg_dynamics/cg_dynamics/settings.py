@@ -13,9 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import textwrap
 import typing
 from collections.abc import Sequence
 from typing import Any
+
+WIDTH, INDENT = 99, ' ' * 6  # of the table
 
 
 def setting(
@@ -78,6 +81,28 @@ def describe(field: dataclasses.Field) -> str:
     if field.metadata['choices']:
         text += f' (one of: {", ".join(field.metadata["choices"])})'
     return text
+
+
+def table(kind: type[Settings]) -> str:
+    """Name, default, description, unit and range of every setting; `*` where it is live."""
+    lines = []
+    for field in dataclasses.fields(kind):
+        minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
+        allowed = '' if minimum is None and maximum is None else f', {_range(minimum, maximum)}'
+        live = ' *' if field.metadata['live'] else ''
+        lines += [f'  {field.name}{live}  [{_shown(field.default)}]',
+                  *textwrap.wrap(f'{describe(field)}{allowed}', WIDTH,
+                                 initial_indent=INDENT, subsequent_indent=INDENT)]  # fmt: skip
+    return '\n'.join(lines)
+
+
+def _shown(value: Any) -> str:
+    """A default as it is written after `-p name:=`."""
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(_shown, value))}]'
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "''" if value == '' else str(value)
 
 
 def check_setting(field: dataclasses.Field, value: Any) -> None:

@@ -3,6 +3,9 @@
 The estimation is in high_gain.py and its rivals, the gathering of messages in samples.py. A state
 is published for every measurement, with its stamp, as long as both positions are fresh; a
 repeated measurement (lock-step) is answered by the same state.
+
+in    /imu, /hip_encoder, /applied_torque, /foot_contact/inner, /foot_contact/outer
+out   /state, /diagnostics
 """
 
 import math
@@ -203,7 +206,7 @@ class ObserverNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_estimation observer_node`."""
-    return run(ObserverNode, args)
+    return run(ObserverNode, ObserverNodeSettings, args)
 
 
 if __name__ == '__main__':

@@ -10,6 +10,9 @@ request is dated ahead or old. When requests stop for longer than `stale_after`,
 sent until they come back. That zero carries the stamp of the last request, so that a machine that
 was held up does not take it for one from the future, and a machine in lock-step not for an answer.
 The hardware has a watchdog of its own behind the gate.
+
+in    /torque_request, /imu, or /joint_states of a pendulum
+out   /torque_command, /diagnostics
 """
 
 import time
@@ -152,7 +155,7 @@ class SafetyGateNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_hardware safety_gate_node`."""
-    return run(SafetyGateNode, args)
+    return run(SafetyGateNode, GateNodeSettings, args)
 
 
 if __name__ == '__main__':

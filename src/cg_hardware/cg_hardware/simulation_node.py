@@ -8,6 +8,11 @@ real_time   Samples are due on the machine's own clock. Each tick publishes the 
 lockstep    The measurement stamped t goes out, then nothing moves until the command stamped t
             is there. The same seed and peers give the same messages at any machine load. A peer
             that does not answer in time ends the run, with zero torque.
+
+in    /torque_command, /recorder/progress
+out   /applied_torque, /experiment, /diagnostics, /clock (lockstep); of a compass gait /imu,
+      /hip_encoder, /hip_encoder/counts, /foot_contact/inner, /foot_contact/outer, of a pendulum
+      /joint_states
 """
 
 import math
@@ -502,7 +507,7 @@ class SimulationNode(LifecycleNode):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_hardware simulation_node`."""
-    return run(SimulationNode, args)
+    return run(SimulationNode, SimulationSettings, args)
 
 
 if __name__ == '__main__':

@@ -4,6 +4,9 @@ The signal is in excitation.py. The first measurement heard is time zero of the 
 answer carries the stamp of the measurement that it answers, so that the same node drives the
 machine in real time and in lock-step. After `duration` it goes on answering with zero torque,
 unless told to exit.
+
+in    /imu, or another `measurement_topic`
+out   /torque_command
 """
 
 import dataclasses
@@ -113,7 +116,7 @@ class ExcitationNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_sysid excitation_node`."""
-    return run(ExcitationNode, args)
+    return run(ExcitationNode, ExcitationNodeSettings, args)
 
 
 if __name__ == '__main__':

@@ -1,7 +1,10 @@
 """ROS node of the recorder: raw subscriptions into a bag. What is on disk: recorder.py.
 
-A SIGKILL at any moment loses the last 10 ms or so; `ros2 run cg_sysid recover BAG` makes a bag
+A SIGKILL at any moment loses the last 10 ms or so; `cg recover BAG` makes a bag
 of the rest. SIGINT and SIGTERM close the bag properly.
+
+in    the sensor and torque topics of `mechanism`, /experiment, and those of `also`
+out   /recorder/progress
 """
 
 import functools
@@ -151,7 +154,7 @@ def qos_entry(profile: QoSProfile) -> dict:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_sysid recorder_node`."""
-    return run(RecorderNode, args)
+    return run(RecorderNode, RecorderSettings, args)
 
 
 if __name__ == '__main__':
