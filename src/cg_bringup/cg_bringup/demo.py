@@ -25,6 +25,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.stop_request import Stopped, stopped_by_signals
 from cg_sysid.diagnosis_file import read_facts
 from cg_sysid.experiments import ExperimentError, load_experiment
+from cg_sysid.progress import Bars
 
 # The last repeats the first with another excitation.
 PROGRAMME = (
@@ -42,7 +43,8 @@ def record_programme(
 ) -> list[Path]:
     """Carry out the experiments; return the bags."""
     bags = []
-    with own_domain() as domain:
+    # On a terminal the status says the same.
+    with own_domain() as domain, Bars('demo', quiet=console.is_terminal) as bars:
         console.print(
             f'[bold]Recording[/] {len(PROGRAMME)} x {duration:g} s (ROS domain {domain})'
         )
@@ -57,6 +59,7 @@ def record_programme(
                 seed=100 * seed + index,
                 duration=duration,
             )
+            bars('recording experiments on the simulated robot', index - 1, len(PROGRAMME))
             with console.status(f'{index}/{len(PROGRAMME)} {name}'):
                 recorded = run_experiment(run)
             messages = sum(recorded.counts.values())

@@ -18,6 +18,7 @@ from cg_bringup.supervisor import ProcessDied, supervised
 from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.stop_request import Stopped
 from cg_sysid.experiments import ExperimentError, experiment_names, load_experiment
+from cg_sysid.progress import Bars
 
 RATE_HZ = 500.0
 START_UP = 60.0  # s that processes and discovery may take on a busy machine
@@ -110,7 +111,7 @@ def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_bringup experiment`."""
     parser = argparse.ArgumentParser(prog='experiment', description=__doc__)
     parser.add_argument('name', help=f'one of {", ".join(experiment_names())}; or a .yaml file')
-    parser.add_argument('--model', type=Path, help='model file of the machine [nominal]')
+    parser.add_argument('--model', type=Path, help='simulated: a file or a name [nominal]')
     parser.add_argument('--seed', type=int, default=1, help='of noise and excitation [1]')
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), help='directory that gets the bag [bags]'
@@ -128,7 +129,10 @@ def main(args: list[str] | None = None) -> int:
             mode=options.mode,
             duration=options.duration,
         )
-        recorded = run_experiment(run)
+        print(f'simulated robot {run.model_path.stem}: {experiment.name}, {run.length:g} s')
+        with Bars('experiment') as bars:
+            bars(f'recording {run.length:g} s of {experiment.name}', 0, 1)
+            recorded = run_experiment(run)
     except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1

@@ -1,5 +1,6 @@
 """Generated C to machine code: compiled once on a kind of machine, cached by content."""
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -7,7 +8,8 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 # -O2 takes a third longer to compile, hundreds of times in a diagnosis, and runs no faster.
@@ -16,6 +18,7 @@ FLAGS = (
     '-O1', '-ftree-vectorize', '-march=native', '-fno-math-errno', '-fno-trapping-math',
     '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math', '-ffp-contract=fast',
 )  # fmt: skip
+UNDER_WAY = '.compiling_'  # then the process; folders in the cache
 PRODUCTS = {'.so': ('-shared', '-fPIC'), '.o': ('-c', '-fPIC')}
 
 
@@ -35,6 +38,16 @@ def compiler() -> str | None:
     if named is not None:
         return shutil.which(named) if named else None
     return next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
+
+
+def seconds_under_way(processes: Collection[int]) -> float:
+    """How long the compiler has been at work for these processes, in s; 0 if it is not."""
+    began = []
+    for process in processes:
+        for directory in cache_directory().glob(f'{UNDER_WAY}{process}_*'):
+            with contextlib.suppress(FileNotFoundError):  # it has just finished
+                began.append(directory.stat().st_mtime)
+    return max(time.time() - min(began), 0.0) if began else 0.0
 
 
 def shared_library(
@@ -87,7 +100,9 @@ def build(
     if gcc is None:
         raise RuntimeError('no C compiler found (cc, gcc, clang)')
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent) as directory:
+    with tempfile.TemporaryDirectory(
+        prefix=f'{UNDER_WAY}{os.getpid()}_', dir=target.parent
+    ) as directory:
         c, made = Path(directory) / 'model.c', Path(directory) / 'made'
         c.write_text(source)
         files = [str(made), str(c), *map(str, objects)]

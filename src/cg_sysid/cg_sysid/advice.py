@@ -77,7 +77,7 @@ def propose(
         _rehearsed,
         [(told, sigma, experiment, excitation)
          for experiment in experiments for excitation in _excitations(experiment)],
-        workers, executor, progress,
+        workers, executor, lambda done, total, _: progress(done, total),
     )  # fmt: skip
     return tuple(
         sorted((p for p in found if p is not None), key=lambda p: p.evidence, reverse=True)

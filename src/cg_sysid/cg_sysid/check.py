@@ -17,6 +17,7 @@ from typing import Any
 
 from rich.console import Console
 
+from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.bags import RawRecording, load_note, read_raw, to_record
 from cg_sysid.check_content import check_content
@@ -29,6 +30,7 @@ from cg_sysid.check_timing import check_timing
 from cg_sysid.clock import mend_clocks
 from cg_sysid.errors import RecordingError
 from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.progress import Bars
 from cg_sysid.touchdown import find_touchdowns
 
 LANDING_S = 0.08  # s that a landing blurs on either side; twice that where the foot bounces
@@ -149,10 +151,10 @@ def parse_region(text: str) -> tuple[str, tuple[float, float]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line: check recordings. Exit code 0 if all are usable, 1 otherwise."""
-    parser = argparse.ArgumentParser(prog='check', description='Check recordings before use.')
+    parser = argparse.ArgumentParser(prog='cg check', description='Check recordings before use.')
     parser.add_argument('bags', nargs='+', help='bag directories')
     parser.add_argument('--json', action='store_true', help='print JSON')
-    parser.add_argument('--model', help='model file that the recordings will be used with')
+    parser.add_argument('--model', help='that they will be used with: a model file or a name')
     parser.add_argument('--note', help='YAML file with the recording note, for bags without one')
     parser.add_argument('--use-region', action='append', default=[], metavar='NAME=LOW:HIGH',
                         help='where the model will be used; may be repeated')
@@ -160,12 +162,15 @@ def main(argv: list[str] | None = None) -> int:
     try:
         region = dict(parse_region(text) for text in args.use_region)
         note = load_note(args.note) if args.note else None
-        if args.model and not Path(args.model).is_file():
-            raise RecordingError(f'{args.model}: no such model file')
+        model = model_path(args.model) if args.model else None
     except (OSError, ValueError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
-    reports = [check_recording(bag, args.model, region, note) for bag in args.bags]
+    reports = []
+    with Bars('cg check') as bars:
+        for done, bag in enumerate(args.bags):
+            bars('checking recordings', done, len(args.bags))
+            reports.append(check_recording(bag, model, region, note))
     if args.json:
         print(json.dumps([report.to_dict() for report in reports], indent=1, default=float))
     else:

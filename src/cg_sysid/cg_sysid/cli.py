@@ -1,15 +1,12 @@
-"""What the command lines share: one-line errors, progress, tables."""
+"""What the command lines share: one-line errors, options, tables."""
 
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from cg_sysid import bags, parallel
@@ -21,49 +18,6 @@ UNUSABLE = 1
 INTERRUPTED = 130
 
 Facts = dict[str, Any]
-
-
-class Bars(AbstractContextManager):
-    """Progress of several pieces of work on stderr; silent where nobody watches.
-
-    Args:
-        quiet: Say nothing even on a terminal.
-    """
-
-    def __init__(self, quiet: bool = False):
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn('{task.description}'),
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=quiet or not console.is_terminal,
-        )
-        self._tasks: dict[str, Any] = {}
-
-    def __enter__(self) -> 'Bars':
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._progress.stop()
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Note that `done` of `total` pieces are finished."""
-        if what not in self._tasks:
-            self._tasks[what] = self._progress.add_task(what, total=total)
-        task = self._tasks[what]
-        self._progress.update(task, completed=done, total=total)
-        if done >= total:
-            # The next round may bear the same name.
-            self._progress.remove_task(self._tasks.pop(what))
 
 
 def run(program: str, work: Callable[[argparse.Namespace], int], options) -> int:
@@ -95,7 +49,10 @@ def one_line(error: BaseException) -> str:
 def common_options(parser: argparse.ArgumentParser) -> None:
     """Options of every program that analyses bags."""
     parser.add_argument('bags', nargs='+', metavar='BAG', help='recordings: bag directories')
-    parser.add_argument('--model', required=True, metavar='FILE', help='model file (YAML)')
+    parser.add_argument(
+        '--model', required=True, metavar='MODEL',
+        help='model: a YAML file, or the name of one that comes along, such as compass_gait_mit',
+    )  # fmt: skip
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR',
         help='directory for the results; files of an earlier run in it are replaced',
@@ -111,7 +68,7 @@ def common_options(parser: argparse.ArgumentParser) -> None:
         help='torque that the model is driven with [applied, or the command where there is none]',
     )  # fmt: skip
     parser.add_argument('--date', help='ISO 8601 date to put into the results [now]')
-    parser.add_argument('--quiet', action='store_true', help='no progress bars, no tables')
+    parser.add_argument('--quiet', action='store_true', help='no progress, no tables')
 
 
 def load_note(path: str | None) -> dict[str, Any] | None:

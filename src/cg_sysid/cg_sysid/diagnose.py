@@ -14,6 +14,7 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from cg_sysid.by_recording import what_wanders
 from cg_sysid.candidates import (
     SAME,
     THOROUGH_ITERATIONS,
+    Look,
     Outcome,
     Task,
     candidates_for,
@@ -90,7 +92,8 @@ FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowher
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
 SMALL_FAULTS = 'small faults'
-Progress = Callable[[str, int, int], None]
+NOTHING_YET = 2  # no fit (0) and no first look (1)
+Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
 
 
@@ -160,7 +163,7 @@ def diagnose(
         model: The nominal model.
         records: At least two recordings that passed the check.
         options: How.
-        progress: Called with (what, done, total).
+        progress: Called with (what, done, total, best candidate so far in words).
         executor: Where candidates are fitted; by default local processes.
         landings: What lies between records that are phases of walking ones (phases.cut_steps); by
             default the records are cut here.
@@ -224,9 +227,10 @@ class _Search:
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
+        self.leading = (NOTHING_YET, np.inf, '')  # the best fit, or look, for the progress
 
     def run(self) -> Diagnosis:
-        base = self.race.fit([Task(self.nominal)], 'nominal model')[0]
+        base = self.race.fit([Task(self.nominal)], 'fitting the nominal model')[0]
         if isinstance(base, str):
             raise IdentificationError(base)
         final = self._extend(base)
@@ -244,9 +248,11 @@ class _Search:
 
     def _added(self, o: Outcome) -> frozenset[str]:
         """Labels of the effects that were put on top of the nominal model, less small faults."""
+        return self._added_to(o.model) - imperfect(o.model, o.task.bounds)
+
+    def _added_to(self, model: Model) -> frozenset[str]:
         stated = {effect.label for effect in self.nominal.effects}
-        small = imperfect(o.model, o.task.bounds)
-        return frozenset(effect.label for effect in o.model.effects) - stated - small
+        return frozenset(effect.label for effect in model.effects) - stated
 
     def _extend(self, o: Outcome) -> Outcome:
         """Accept one effect after the other, until nothing more is earned."""
@@ -551,8 +557,22 @@ class _Search:
     def carry_out(self, function: Callable, arguments: list[tuple], what: str) -> list:
         return run_all(
             function, arguments, self.options.workers, self.executor,
-            lambda done, total: self.progress(what, done, total),
+            lambda done, total, result: self.progress(what, done, total, self._best(result)),
         )  # fmt: skip
+
+    def _best(self, result: Any) -> str:
+        """The best candidate after one more result, in words: a fit, before any a first look."""
+        if isinstance(result, Outcome):
+            error, label = result.train.normalised_error, self._title(self._added(result))
+            self.leading = min(self.leading, (0, error, label))
+        elif isinstance(result, Look) and result.error > 0:
+            title = self._title(self._added_to(result.task.model) | {result.label})
+            self.leading = min(self.leading, (1, result.error, title))
+        kind, error, label = self.leading
+        if kind == NOTHING_YET:
+            return ''
+        where = ' in the first seconds' if kind else ''
+        return f'{label}, off by {error**0.5:.3g} times the noise{where}'
 
     def _title(self, added: frozenset[str]) -> str:
         return ' + '.join(['nominal', *sorted(added)])
@@ -593,7 +613,10 @@ class _Search:
             return ()
         return propose(
             rivals, self.train[0].sigma, self.options.experiments, self.options.workers,
-            self.executor, lambda done, total: self.progress('rehearsals', done, total),
+            self.executor,
+            lambda done, total: self.progress(
+                'rehearsing experiments to tell causes apart', done, total, self._best(None)
+            ),
         )[:PROPOSED]  # fmt: skip
 
     def _remaining(self, o: Outcome) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Command line: what does my simulation get wrong about these recordings, and why?
 
-    diagnose --model MODEL.yaml --out DIR BAG [BAG ...]
+    cg diagnose --model MODEL --out DIR BAG [BAG ...]
 
 Writes DIR/diagnosis.json, DIR/report.html, DIR/curves.npz and, where records could be used,
 DIR/model.yaml: the model with the causes in it. What no cause explains is in DIR/learned.yaml: the
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
@@ -27,6 +28,7 @@ from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, writ
 from cg_sysid.experiments import experiments_for
 from cg_sysid.faults import FaultSignal
 from cg_sysid.intake import Intake, take_in
+from cg_sysid.progress import Bars
 from cg_sysid.provenance import provenance
 from cg_sysid.record import Record
 from cg_sysid.report import write_report
@@ -52,7 +54,7 @@ exit code 0 with an answer, 1 if the recordings are unusable, 2 for a wrong argu
 def parser() -> argparse.ArgumentParser:
     """The options."""
     made = argparse.ArgumentParser(
-        prog='diagnose',
+        prog='cg diagnose',
         description='Say what a simulation gets wrong about recordings, name the cause, and '
         'show how much better the model is with that cause in it.',
         epilog=EPILOG,
@@ -80,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run('diagnose', work, parser().parse_args(args))
+    return cli.run('cg diagnose', work, parser().parse_args(args))
 
 
 def work(options: argparse.Namespace) -> int:
@@ -93,18 +95,19 @@ def work(options: argparse.Namespace) -> int:
         raise ValueError('--workers are local processes; leave it out where --scheduler is given')
     if options.out.is_file():
         raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
-    model = Model.load(options.model)
+    model_file = model_path(options.model)
+    model = Model.load(model_file)
     effects = _effects(options.effects, model)
     note = cli.load_note(options.note)
     fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
-    with fitters as executor, cli.Bars(options.quiet) as bars:
+    with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
         intake = take_in(
-            options.bags, options.model, note, options.torque, options.window, bars
+            options.bags, model_file, note, options.torque, options.window, bars
         )
         _same_mechanism(model, intake.records)
         origin = provenance(
-            options.model,
-            ['diagnose', *_command(options)],
+            model_file,
+            ['cg', 'diagnose', *_command(options)],
             {
                 'effects': options.effects or 'all', 'rounds': options.rounds,
                 'window_s': options.window, 'held': options.held or 'automatic',

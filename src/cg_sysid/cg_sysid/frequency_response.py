@@ -1,6 +1,6 @@
 """Frequency response from torque to each sensor: where a machine is not rigid (seed 4.4).
 
-    ros2 run cg_sysid frequency_response BAG --model compass_gait_mit.yaml --out DIRECTORY
+    cg frequency-response BAG --model compass_gait_mit --out DIRECTORY
 
 The response is estimated by Welch's method over windows of the record,
 
@@ -34,6 +34,7 @@ from cg_dynamics.linearise import linearise, without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.bags import read_bag
+from cg_sysid.progress import Bars
 from cg_sysid.record import Record
 
 WINDOW = 4.0  # s; resolves 0.25 Hz
@@ -299,23 +300,28 @@ def draw(record: Record, paths: Sequence[Response], found, target: Path) -> None
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `ros2 run cg_sysid frequency_response`."""
+    """Entry point of `cg frequency-response`."""
     parser = argparse.ArgumentParser(
-        prog='frequency_response',
+        prog='cg frequency-response',
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('bag', help='bag of an excited machine: a chirp or a multisine')
-    parser.add_argument('--model', help='rigid model file; writes it with the resonance in it')
+    parser.add_argument(
+        '--model', help='rigid model, a file or a name; writes it with the resonance in it'
+    )
     parser.add_argument('--out', type=Path, default=Path('.'), help='directory for the results')
     options = parser.parse_args(args)
     try:
-        record = read_bag(options.bag)
-        paths, found = analyse(record)
+        with Bars('cg frequency-response') as bars:
+            bars('reading the recording', 0, 2)
+            record = read_bag(options.bag)
+            bars('finding resonances', 1, 2)
+            paths, found = analyse(record)
         effect, why = seat(found)
         model = Model.load(options.model) if options.model else None
     except (ValueError, OSError) as error:
-        print(f'frequency_response: error: {error}', file=sys.stderr)
+        print(f'cg frequency-response: error: {error}', file=sys.stderr)
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     for channel, peak in found.items():

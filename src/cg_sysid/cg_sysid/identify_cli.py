@@ -1,6 +1,6 @@
 """Command line: the parameters of a model from recordings.
 
-    identify --model MODEL.yaml --out DIR BAG [BAG ...]
+    cg identify --model MODEL --out DIR BAG [BAG ...]
 
 Writes DIR/identification.json, DIR/model.yaml, DIR/report.html and DIR/curves.npz.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from cg_description.paths import model_path
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
@@ -22,6 +23,7 @@ from cg_sysid.errors import RecordingError
 from cg_sysid.identify import Fit, fit, predict, score
 from cg_sysid.intake import Intake, take_in
 from cg_sysid.nelder_mead import nelder_mead
+from cg_sysid.progress import Bars
 from cg_sysid.provenance import provenance
 from cg_sysid.report import write_report
 from cg_sysid.text import measured, number, plain_unit
@@ -34,7 +36,7 @@ METHODS: dict[str, Callable[..., Fit]] = {'gauss_newton': fit, 'nelder_mead': ne
 def parser() -> argparse.ArgumentParser:
     """The options."""
     made = argparse.ArgumentParser(
-        prog='identify',
+        prog='cg identify',
         description='Identify the parameters of a model from recordings, by simulation error.',
         epilog='exit code 0 with an answer, 2 for a wrong argument or recordings that cannot '
         'be used',
@@ -52,19 +54,20 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run('identify', work, parser().parse_args(args))
+    return cli.run('cg identify', work, parser().parse_args(args))
 
 
 def work(options: argparse.Namespace) -> int:
     """Read, check, identify, write."""
     if options.out.is_file():
         raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
-    model = Model.load(options.model)
+    model_file = model_path(options.model)
+    model = Model.load(model_file)
     note = cli.load_note(options.note)
     only = tuple(n.strip() for n in options.only.split(',')) if options.only else None
-    with cli.Bars(options.quiet) as bars:
+    with Bars('cg identify', options.quiet) as bars:
         intake = take_in(
-            options.bags, options.model, note, options.torque, options.window, bars
+            options.bags, model_file, note, options.torque, options.window, bars
         )
         if not intake.records:
             first = intake.left_out[0]
@@ -75,8 +78,8 @@ def work(options: argparse.Namespace) -> int:
         bars('identifying', 1, 1)
         before = _score(model, trials)
         origin = provenance(
-            options.model,
-            ['identify', *_command(options)],
+            model_file,
+            ['cg', 'identify', *_command(options)],
             {
                 'method': options.method, 'only': list(only) if only else 'all free',
                 'window_s': options.window, 'input': options.torque or 'automatic',

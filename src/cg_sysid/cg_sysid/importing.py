@@ -1,6 +1,6 @@
 """Import of foreign logs: a mapping file says which column is which channel.
 
-    python3 -m cg_sysid.importing sydney_pendulum DATA_DIR --out BAGS
+    cg import sydney_pendulum DATA_DIR --out BAGS
 
 A mapping (`cg_import/1`, docs/data.md) names the files, the time column, the expression
 (expressions.py) of each channel, filters and splits of rows, and the recording note. The bags
@@ -10,7 +10,7 @@ that come out are the same as those that the robot records.
 import argparse
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -38,6 +38,7 @@ from cg_sysid import channels
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.errors import RecordingError
 from cg_sysid.expressions import UNITS, Expression, evaluate
+from cg_sysid.progress import Bars
 from cg_sysid.raw import NOTE, NOTE_FORMAT
 from cg_sysid.record import NS_PER_S, Record
 from cg_sysid.tables import Table, read_table
@@ -213,12 +214,17 @@ def load_mapping(name: str | Path) -> dict[str, Any]:
     return {**mapping, 'name': path.stem}
 
 
-def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> Iterator[Imported]:
+def import_logs(
+    mapping: str | Path | dict[str, Any],
+    data_dir: str | Path,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+) -> Iterator[Imported]:
     """The records that a mapping makes of the files of a folder.
 
     Args:
         mapping: Name or path of a mapping, or what `load_mapping` returned.
         data_dir: Folder that the mapping's `files` are relative to.
+        progress: Called with (what, done, total).
 
     Yields:
         One record per file, or per part where the mapping splits files.
@@ -233,7 +239,8 @@ def import_logs(mapping: str | Path | dict[str, Any], data_dir: str | Path) -> I
     found = sorted({path for pattern in patterns for path in data_dir.glob(pattern)})
     if not found:
         raise RecordingError(f'{data_dir}: no file matches {", ".join(patterns)}')
-    for path in found:
+    for done, path in enumerate(found):
+        progress('reading logs and writing recordings', done, len(found))
         table = read_table(path)
         for number, rows in enumerate(_parts(mapping, table, path), start=1):
             yield _record_of(mapping, path, table, rows, number)
@@ -429,7 +436,7 @@ def import_to_bags(
 def main(argv: list[str] | None = None) -> int:
     """Command line: import foreign logs to bags."""
     parser = argparse.ArgumentParser(
-        prog='import', description='Import CSV, MAT or JSON logs to bags by a mapping file.'
+        prog='cg import', description='Import CSV, MAT or JSON logs to bags by a mapping file.'
     )
     parser.add_argument('mapping', nargs='?', help='name of a mapping, or path of its YAML file')
     parser.add_argument('data_dir', nargs='?', help="folder that the mapping's files are in")
@@ -443,10 +450,11 @@ def main(argv: list[str] | None = None) -> int:
     if args.mapping is None or args.data_dir is None:
         parser.error('a mapping and a data folder are needed (or --list)')
     try:
-        for imported in import_logs(args.mapping, args.data_dir):
-            path = Path(args.out) / imported.record.name
-            write_bag(path, replace(imported.record, source=''), imported.commands)
-            print(f'{path}: {len(imported.record)} rows, {imported.record.duration:.2f} s')
+        with Bars('cg import') as bars:
+            for imported in import_logs(args.mapping, args.data_dir, bars):
+                path = Path(args.out) / imported.record.name
+                write_bag(path, replace(imported.record, source=''), imported.commands)
+                print(f'{path}: {len(imported.record)} rows, {imported.record.duration:.2f} s')
     except ValueError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1

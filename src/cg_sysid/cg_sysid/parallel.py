@@ -5,14 +5,19 @@ does record by record goes to threads, as compiled simulations run beside Python
 """
 
 import multiprocessing
+import multiprocessing.context
 import os
 import signal
+import sys
+import threading
+import types
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextvars import ContextVar
 from typing import Any
 
 _pool: ProcessPoolExecutor | None = None
+_knows_script = False  # whether the processes of the pool have run the script
 _threads: ContextVar[ThreadPoolExecutor | None] = ContextVar('threads', default=None)
 
 
@@ -21,7 +26,7 @@ def run_all(
     arguments: Sequence[tuple],
     workers: int | None = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int, Any], None] = lambda done, total, result: None,
 ) -> list[Any]:
     """function(*a) for each a in arguments, in parallel.
 
@@ -30,24 +35,27 @@ def run_all(
         arguments: One tuple per call.
         workers: Local processes; by default one per core, 0 or 1 to stay on one core.
         executor: Use this instead.
-        progress: Called with (done, total).
+        progress: Called with (done, total, result of the piece that was finished last), first with
+            (0, total, None).
     """
     total = len(arguments)
+    if total:
+        progress(0, total, None)
     cores = (os.cpu_count() or 1) if workers is None else workers
     if executor is None and cores < 2:
         results = []
         for done, a in enumerate(arguments, start=1):
             results.append(function(*a))
-            progress(done, total)
+            progress(done, total, results[-1])
         return results
     if executor is None and total == 1:
         results = [_with_threads(cores, function, *arguments[0])]
-        progress(1, 1)
+        progress(1, 1, results[0])
         return results
-    futures = [(executor or _local(workers)).submit(function, *a) for a in arguments]
+    executor = executor or _local(workers, function.__module__ == '__main__')
+    futures = [executor.submit(function, *a) for a in arguments]
     for done, future in enumerate(as_completed(futures), start=1):
-        future.result()
-        progress(done, total)
+        progress(done, total, future.result())
     return [future.result() for future in futures]
 
 
@@ -71,17 +79,46 @@ def _with_threads(cores: int, function: Callable[..., Any], *arguments: Any) -> 
             _threads.reset(token)
 
 
-def _local(workers: int | None) -> ProcessPoolExecutor:
+class _Process(multiprocessing.context.SpawnProcess):
+    """A process that is started without the script that runs in this one.
+
+    A spawned process otherwise runs the script once more, for the sake of what it defines: where
+    that is not behind `if __name__ == '__main__'` all its work would begin again in every process,
+    and Python breaks the pool. Our work is defined in modules, and needs no script.
+    """
+
+    def start(self) -> None:
+        """Start with the `__main__` of an interactive Python, which has no file to run."""
+        with _starting:
+            script = sys.modules['__main__']
+            sys.modules['__main__'] = types.ModuleType('__main__')
+            try:
+                super().start()
+            finally:
+                sys.modules['__main__'] = script
+
+
+class _Modules(multiprocessing.context.SpawnContext):
+    Process = _Process  # type: ignore[assignment]
+
+
+_starting = threading.Lock()
+
+
+def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
     # One pool for the life of the process: starting it costs an import of CasADi per worker.
     # spawn, not fork: a forked child would inherit threads' locks (DDS, BLAS) in unknown states.
     # One BLAS thread each: the matrices are small, and the workers fill the cores.
-    global _pool
+    global _pool, _knows_script
+    if script and not _knows_script:
+        stop()
     if _pool is None:
+        _knows_script = script
         for library in ('OPENBLAS', 'OMP', 'MKL'):
             os.environ.setdefault(f'{library}_NUM_THREADS', '1')
         _pool = ProcessPoolExecutor(
             workers or os.cpu_count(),
-            mp_context=multiprocessing.get_context('spawn'),
+            mp_context=multiprocessing.get_context('spawn') if script else _Modules(),
             initializer=_ignore_interrupts,
         )
     return _pool
@@ -90,6 +127,12 @@ def _local(workers: int | None) -> ProcessPoolExecutor:
 def _ignore_interrupts() -> None:
     # Ctrl-C reaches every process of the terminal; the one that was started answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def processes() -> list[int]:
+    """Ids of this process and of those that work for it here."""
+    workers = [] if _pool is None else list(_pool._processes or ())
+    return [os.getpid(), *workers]
 
 
 def stop() -> None:

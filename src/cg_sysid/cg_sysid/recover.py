@@ -1,6 +1,6 @@
 """Make an ordinary bag of what a recording left on disk, complete or killed. Pure; no ROS.
 
-`ros2 run cg_sysid recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
+`cg recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
 the journals of this project's recorder, and on any MCAP bag whose writer died: everything up to
 the first damaged record is kept. The bag is complete on disk at every moment: the new file
 replaces the old one in one step, and metadata.yaml comes last.
@@ -24,6 +24,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from cg_sysid.progress import Bars
 
 JOURNAL_NAME = 'journal.mcap'
 WORK_NAME = '.recovering'
@@ -221,9 +223,9 @@ def _replace(target: Path, staged: Path, sources: list[Path], result: Recovered)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point of `ros2 run cg_sysid recover`."""
+    """Entry point of `cg recover`."""
     parser = argparse.ArgumentParser(
-        prog='recover', description='Make an ordinary bag of a recording that was cut off.'
+        prog='cg recover', description='Make an ordinary bag of a recording that was cut off.'
     )
     parser.add_argument('bag', nargs='+', help='bag directory or .mcap file')
     parser.add_argument(
@@ -231,12 +233,14 @@ def main(args: list[str] | None = None) -> int:
     )
     status = 0
     options = parser.parse_args(args)
-    for bag in options.bag:
+    for done, bag in enumerate(options.bag):
         if Path(bag).exists() and not options.force and not needs_recovery(bag):
             print(f'{bag}: nothing to recover')
             continue
         try:
-            result = recover(bag)
+            with Bars('cg recover') as bars:
+                bars(f'recovering {bag}', done, len(options.bag))
+                result = recover(bag)
         except (RecoveryError, OSError) as error:
             print(f'error: {error}', file=sys.stderr)
             status = 1

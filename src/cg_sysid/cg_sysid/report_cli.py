@@ -12,7 +12,7 @@ from cg_sysid.report import write_report
 def parser() -> argparse.ArgumentParser:
     """The options."""
     made = argparse.ArgumentParser(
-        prog='report',
+        prog='cg report',
         description='Draw the report of a diagnosis or an identification again, from '
         'diagnosis.json or identification.json and curves.npz.',
     )
@@ -23,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run('report', work, parser().parse_args(args))
+    return cli.run('cg report', work, parser().parse_args(args))
 
 
 def work(options: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from rich.console import Console
 
+from cg_description.paths import model_names
 from cg_dynamics.model import Model
 from cg_sysid import cli, diagnose_cli, identify_cli, parallel, report_cli
 from cg_sysid.bags import read_bag, write_bag
@@ -180,7 +181,8 @@ BAD = {
                   '--rounds is 0; at least 1 is needed'),
     'no model': (
         '--model {tmp}/none.yaml --out {tmp}/o {a} {b}',
-        '{tmp}/none.yaml: cannot be read: No such file or directory',
+        "no model '{tmp}/none.yaml': there is no file {tmp}/none.yaml, and those that come along "
+        'are called ' + ', '.join(model_names()),
     ),
     'a model with a wrong unit': (
         '--model {tmp}/unit.yaml --out {tmp}/o {a} {b}',
@@ -209,14 +211,14 @@ BAD = {
 def test_bad_input_gets_one_line(places, capsys, what):
     words, error = (text.format(**places) for text in BAD[what])
     assert diagnose_cli.main(words.split()) == 2
-    assert capsys.readouterr().err == f'diagnose: error: {error}\n'
+    assert capsys.readouterr().err == f'cg diagnose: error: {error}\n'
 
 
 def test_an_unknown_effect_is_refused_with_the_library(places, capsys):
     words = '--model {m} --out {tmp}/o --effects torque_bias,gremlins {a} {b}'.format(**places)
     assert diagnose_cli.main(words.split()) == 2
     said = capsys.readouterr().err
-    assert said.startswith("diagnose: error: --effects: no effect 'gremlins'; the library has: ")
+    assert said.startswith("cg diagnose: error: --effects: no effect 'gremlins'; the library ")
     assert said.count('\n') == 1
 
 
@@ -224,7 +226,7 @@ def test_an_unknown_parameter_is_refused(places, capsys):
     words = '--model {m} --out {tmp}/o --only c9 {a}'.format(**places)
     assert identify_cli.main(words.split()) == 2
     said = capsys.readouterr().err
-    assert said.startswith("identify: error: no parameter 'c9' to identify; there are: ")
+    assert said.startswith("cg identify: error: no parameter 'c9' to identify; there are: ")
     assert said.count('\n') == 1
 
 
@@ -239,8 +241,8 @@ def test_a_bag_of_another_machine_is_refused(places, capsys):
     words = '--model {m} --out {tmp}/o {a} {b}'.format(**places).split()
     assert diagnose_cli.main([*words, str(bag)]) == 2
     assert capsys.readouterr().err == (
-        f"diagnose: error: {bag}: recorded on a pendulum, but the model 'compass_gait_mit' is of "
-        'a compass_gait\n'
+        f"cg diagnose: error: {bag}: recorded on a pendulum, but the model 'compass_gait_mit' is "
+        'of a compass_gait\n'
     )
 
 
@@ -253,7 +255,7 @@ def test_a_bag_of_another_machine_is_refused(places, capsys):
 )
 def test_a_report_of_nothing_is_refused(places, capsys, name, error):
     assert report_cli.main([str(places['tmp'] / name)]) == 2
-    assert capsys.readouterr().err == f'report: error: {error.format(**places)}\n'
+    assert capsys.readouterr().err == f'cg report: error: {error.format(**places)}\n'
 
 
 def test_an_interrupt_ends_with_one_line(capsys):

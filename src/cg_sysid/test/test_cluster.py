@@ -343,7 +343,7 @@ def test_no_scheduler_is_one_line_within_seconds(
         assert code == 2
         assert time.monotonic() - begun < 10 * cluster.ANSWER_S
     assert capsys.readouterr().err == (
-        f'diagnose: error: no scheduler answers at {address} within 1 s\n'
+        f'cg diagnose: error: no scheduler answers at {address} within 1 s\n'
     )
 
 
@@ -369,6 +369,6 @@ def test_workers_of_two_kinds_are_not_asked_for_at_once(bags, model_file, tmp_pa
     words = f'--model {model_file} --out {tmp_path} --workers 2 --scheduler tcp://h:1 {bags[0]}'
     assert diagnose_cli.main(words.split()) == 2
     assert capsys.readouterr().err == (
-        'diagnose: error: --workers are local processes; leave it out where --scheduler is '
+        'cg diagnose: error: --workers are local processes; leave it out where --scheduler is '
         'given\n'
     )
