@@ -1,12 +1,15 @@
 """The scripts of the workspace: what they refuse, they refuse in one sentence and exit with 1."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from cg_sysid.command import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -90,7 +93,12 @@ def test_setup_refuses_jazzy_without_rclpy(bare):
 
 
 def test_cg_names_what_there_is():
-    assert_refused(run('./cg', 'fly'), 'fly', 'list, run, launch, exec')
+    wrong = run('./cg', 'fly')
+    assert (wrong.returncode, wrong.stdout) == (2, '')
+    assert wrong.stderr.splitlines() == [wrong.stderr.strip()]
+    assert "no command 'fly'" in wrong.stderr
+    assert 'list, run, launch, exec' in wrong.stderr
+    assert "did you mean 'launch'?" in run('./cg', 'lanch').stderr
     assert_refused(run('./cg', 'run', 'cg_none', 'x'), 'cg_none', 'cg_hardware')
     assert_refused(run('./cg', 'run', 'cg_hardware', 'x'), "'x'", 'simulation_node')
     listing = run('./cg', 'list', 'cg_sysid')
@@ -98,7 +106,18 @@ def test_cg_names_what_there_is():
     assert 'diagnose' in listing.stdout.split()
 
 
+def test_cg_passes_on_what_is_done_with_files():
+    said = run('./cg', '--help').stdout
+    for name in ('list', 'run', 'launch', 'exec', *COMMANDS):
+        assert re.search(rf'^    (\./cg )?{name} ', said, re.MULTILINE), name
+    listing = run('./cg', 'import', '--list')
+    assert listing.returncode == 0
+    assert 'sydney_pendulum: ' in listing.stdout
+    assert run('./cg', 'report', 'none').returncode == 2
+
+
 def test_cg_before_the_first_set_up(bare):
+    assert './cg run PACKAGE EXECUTABLE' in run('./cg', '--help', root=bare).stdout
     assert_refused(run('./cg', 'list', root=bare), 'make setup')
 
 

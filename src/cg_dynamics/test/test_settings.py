@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from cg_dynamics.settings import Settings, describe, setting
+from cg_dynamics.settings import Settings, describe, setting, table
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,15 @@ def test_defaults_are_valid():
 def test_refusals_name_the_setting_its_value_and_what_is_allowed(change, message):
     with pytest.raises(ValueError, match=message):
         Sample(**change)
+
+
+def test_the_table_says_name_default_unit_and_range_of_each():
+    assert table(Sample) == (
+        '  rate  [500.0]\n      rate [Hz], 1.0 to 2000.0\n'
+        '  mode  [a]\n      mode (one of: a, b)\n'
+        '  weights  [[1.0]]\n      weights, 0.0 or more\n'
+        "  name  ['']\n      free text"
+    )
 
 
 def test_lists_become_tuples_and_texts_stay():

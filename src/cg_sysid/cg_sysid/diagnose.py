@@ -72,7 +72,7 @@ from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.race import RUNGS, Effects, Race
 from cg_sysid.record import Record
-from cg_sysid.text import measured
+from cg_sysid.text import measured, off_by
 from cg_sysid.trial import Trial, prepare
 from cg_sysid.unknowns import IdentificationError
 from cg_sysid.wandering import Wandering
@@ -572,7 +572,7 @@ class _Search:
         if kind == NOTHING_YET:
             return ''
         where = ' in the first seconds' if kind else ''
-        return f'{label}, off by {error**0.5:.3g} times the noise{where}'
+        return f'{label}, {off_by(error)}{where}'
 
     def _title(self, added: frozenset[str]) -> str:
         return ' + '.join(['nominal', *sorted(added)])

@@ -13,7 +13,7 @@ parameters far outside what the model file believes.
 """
 
 import time as clock
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_sysid.evidence import weight_of
 from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, moved, own_values, reduced
+from cg_sysid.text import off_by
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
 from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknowns_of
@@ -42,7 +43,9 @@ HALF = 0.5  # share that a step takes off a positive value, before it takes less
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
 HOPE = 10.0  # times that gain, within which it may still come there
+WHOLE = 'fitting whole records, in rounds until it settles'
 ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
+Progress = Callable[[str, int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,13 @@ class _Descent:
     point: Point | None
     converged: bool
     hopeless: bool = False
+
+
+def _so_far(found: _Descent) -> str:
+    """How good a descent is, in words."""
+    if found.point is None:
+        return ''
+    return off_by(float(found.point.sse.sum() / max(found.point.count.sum(), 1)))
 
 
 @dataclass(frozen=True)
@@ -164,6 +174,7 @@ def fit(
     bounds: Mapping[str, float] | None = None,
     thorough: bool = False,
     reach: float = np.inf,
+    progress: Progress = lambda what, done, total, best: None,
 ) -> Fit:
     """Identify a model's parameters from trials.
 
@@ -183,6 +194,7 @@ def fit(
             standard deviation is all that is left to gain, with finer integration. For values
             that are to be as good as their intervals say.
         reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
+        progress: Called with (what, done, total, how good it is so far in words).
 
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
@@ -200,7 +212,10 @@ def fit(
     weight = 1.0 if start is None else 1 / start.inflation
     stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
     found = _Descent(theta, motions, None, False)
-    for horizon in stages:
+    at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
+    rounds = max(1, iterations // max(1, at_once))
+    for k, horizon in enumerate(stages):
+        progress(f'fitting the first {horizon:g} s', k, len(stages) + rounds, _so_far(found))
         # The short horizons only lead the way; the belief of the file keeps them sober.
         ahead = _minimise(
             problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
@@ -209,10 +224,10 @@ def fit(
             found = ahead
             weight = _weight(problem, ahead.point) if reweight else 1.0
         if found.hopeless:
-            iterations = 0
+            at_once, rounds = 0, 1
             break
-    at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
-    for _ in range(max(1, iterations // max(1, at_once))):
+    for k in range(rounds):
+        progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
         found = _minimise(
             problem, found.theta, found.motions, longest, weight, at_once,
             0.0 if thorough else DRIFT, reach,

@@ -73,9 +73,8 @@ def work(options: argparse.Namespace) -> int:
             first = intake.left_out[0]
             raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
         trials = prepare(model, intake.records)
-        bars('identifying', 0, 1)
-        found = METHODS[options.method](model, trials, only=only)
-        bars('identifying', 1, 1)
+        found = METHODS[options.method](model, trials, only=only, progress=bars)
+        bars('writing the report', 0, 1)
         before = _score(model, trials)
         origin = provenance(
             model_file,
@@ -97,6 +96,7 @@ def work(options: argparse.Namespace) -> int:
         curves.save(lines, options.out, faults)
         identified_model(model, found, facts, intake).save(options.out / 'model.yaml')
         write_report(options.out)
+        bars('writing the report', 1, 1)
     cli.print_left_out(facts)
     cli.print_steps(Console(), intake.steps, intake.phases)
     show(Console(), facts, options.out, options.quiet)

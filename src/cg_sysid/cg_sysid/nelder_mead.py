@@ -9,15 +9,16 @@ again between searches, since no recording states it exactly.
 """
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from cg_dynamics.model import Model
-from cg_sysid.identify import Fit, score
+from cg_sysid.identify import Fit, Progress, score
 from cg_sysid.simulation_error import Problem
+from cg_sysid.text import off_by
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns, unknowns_of
 
@@ -34,6 +35,7 @@ def nelder_mead(
     trials: Sequence[Trial],
     only: Sequence[str] | None = None,
     evaluations: int | None = None,
+    progress: Progress = lambda what, done, total, best: None,
 ) -> Fit:
     """Identify a model's parameters by a simplex search on the simulation error.
 
@@ -42,6 +44,7 @@ def nelder_mead(
         trials: Prepared records.
         only: Full names of the parameters to identify; by default all that are free.
         evaluations: Limit of simulations of all records.
+        progress: Called with (what, done, total, how good it is so far in words).
 
     Returns:
         A fit without uncertainties: the method gives none, so that they are infinite.
@@ -69,6 +72,7 @@ def nelder_mead(
             f'({", ".join(t.name for t in trials)}); a simplex search cannot start there'
         )
     limit = evaluations or EVALUATIONS_PER_UNKNOWN * len(values)
+    cost.progress = lambda done, best: progress('simplex search', done, limit, best)
     for _ in range(SEARCHES):
         found = _search(cost, values, limit - cost.problem.evaluations)
         settled = found.success and np.allclose(found.x, values, rtol=TOLERANCE, atol=1e-9)
@@ -147,6 +151,8 @@ class _Cost:
 
     def __init__(self, problem: Problem, motions: list[np.ndarray]):
         self.problem, self.motions = problem, motions
+        self.best = np.inf  # chi2/N
+        self.progress: Callable[[int, str], None] = lambda done, best: None
 
     def __call__(self, values: np.ndarray) -> float:
         problem = self.problem
@@ -155,7 +161,9 @@ class _Cost:
             return RUNAWAY
         if problem.consistency is not None and not (problem.consistency(values)[0] > 0).all():
             return RUNAWAY
-        sse, _ = self.errors(values)
+        sse, count = self.errors(values)
+        self.best = min(self.best, float(sse.sum() / max(count.sum(), 1)))
+        self.progress(problem.evaluations, off_by(self.best))
         return float(sse.sum()) if np.isfinite(sse).all() else RUNAWAY
 
     def errors(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

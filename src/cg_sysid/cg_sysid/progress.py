@@ -67,7 +67,7 @@ class Bars(AbstractContextManager):
             disable=quiet or not watched,
         )
         self._tasks: dict[str, Any] = {}
-        self._lines = None if quiet or watched else Lines(program)
+        self._lines = None if quiet or watched else Lines(program, EVERY)
 
     def __enter__(self) -> 'Bars':
         self._progress.start()
@@ -104,14 +104,14 @@ class Lines:
 
     Args:
         program: Name at the head of each line.
-        stream: Where to; stderr by default.
         every: Time between lines in s.
+        stream: Where to; stderr by default.
 
     Attributes:
         stage: How far it is.
     """
 
-    def __init__(self, program: str, stream: TextIO | None = None, every: float = EVERY):
+    def __init__(self, program: str, every: float, stream: TextIO | None = None):
         self.stage = Stage('starting', 0, 1)
         self._program, self._stream, self._every = program, stream or sys.stderr, every
         self._began = time.monotonic()

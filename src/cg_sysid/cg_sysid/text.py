@@ -81,3 +81,8 @@ def listed(words: list[str], last: str = 'and') -> str:
 def sentence(text: str) -> str:
     """With a capital first letter."""
     return text[:1].upper() + text[1:]
+
+
+def off_by(error: float) -> str:
+    """A mean squared error in squared standard deviations of the noise, in words."""
+    return f'off by {error**0.5:.3g} times the noise'

@@ -1,6 +1,8 @@
 """One piece of work alone has all cores; what it comes to is the same to the bit."""
 
 import math
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -40,6 +42,42 @@ def test_results_come_in_order_and_errors_through():
     assert list(side_by_side(abs, [-3, -1])) == [3, 1]
     with pytest.raises(ValueError, match=r'math domain|nonnegative'):
         run_all(_roots, [([4.0, -1.0],)], workers=2)
+
+
+SCRIPT = """
+from cg_sysid.parallel import run_all
+import math
+print('once', flush=True)
+print(run_all(math.sqrt, [(4.0,), (9.0,)], workers=2))
+"""
+GUARDED = """
+from cg_sysid.parallel import run_all
+import math
+def cube(x):
+    return x**3
+if __name__ == '__main__':
+    print(run_all(math.sqrt, [(4.0,), (9.0,)], workers=2))
+    print(run_all(cube, [(2.0,), (3.0,)], workers=2))
+"""
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [(SCRIPT, 'once\n[2.0, 3.0]\n'), (GUARDED, '[2.0, 3.0]\n[8.0, 27.0]\n')],
+)
+def test_a_plain_script_needs_no_guard_and_may_have_functions_of_its_own(text, said, tmp_path):
+    (tmp_path / 'script.py').write_text(text)
+    done = subprocess.run(
+        [sys.executable, 'script.py'], cwd=tmp_path, capture_output=True, text=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.returncode) == (said, 0), done.stderr
+
+
+def test_progress_hears_of_every_result_as_it_comes():
+    heard = []
+    run_all(math.sqrt, [(4.0,), (9.0,)], workers=0, progress=lambda *said: heard.append(said))
+    assert heard == [(0, 2, None), (1, 2, 2.0), (2, 2, 3.0)]
 
 
 def _squares(items):
