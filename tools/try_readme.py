@@ -69,7 +69,8 @@ def carry_out(block: Block, folder: Path) -> None:
         began, used = time.monotonic(), cpu_of_children()
         # As typed line after line; -e, so that no failure is passed over.
         done = subprocess.run(['bash', '-e', '-c', block.text], cwd=folder, check=False)
-        print(f'({time.monotonic() - began:.0f} s, {cpu_of_children() - used:.0f} s of CPU)')
+        spent = f'{time.monotonic() - began:.0f} s, {cpu_of_children() - used:.0f} s of CPU'
+        print(f'({spent})', flush=True)
         if done.returncode:
             sys.exit(f'try_readme: exit code {done.returncode} of\n{block.text}')
 
