@@ -129,7 +129,8 @@ def main(args: list[str] | None = None) -> int:
             mode=options.mode,
             duration=options.duration,
         )
-        print(f'simulated robot {run.model_path.stem}: {experiment.name}, {run.length:g} s')
+        what = f'{experiment.name}, {run.length:g} s'
+        print(f'simulated robot {run.model_path.stem}: {what}', flush=True)
         with Bars('experiment') as bars:
             bars(f'recording {run.length:g} s of {experiment.name}', 0, 1)
             recorded = run_experiment(run)
