@@ -24,6 +24,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 FILE_NAMED_BEFORE = re.compile(r'a file `([\w.]+)`:\s*\Z')
+OURS = re.compile('^from cg_', re.MULTILINE)
 PIP_INSTALL = re.compile(r'`pip (install [^`]+)`')
 
 
@@ -92,7 +93,7 @@ def try_pip(readme: str, folder: Path) -> None:
     subprocess.run([place / 'bin' / 'python', '-m', 'pip', *arguments], cwd=folder, check=True)
     ours = sorted(
         path.name for path in (place / 'bin').iterdir()
-        if path.name not in before and 'cg_' in path.read_text(encoding='utf-8', errors='replace')
+        if path.name not in before and OURS.search(path.read_text('utf-8', errors='replace'))
     )  # fmt: skip
     if ours != ['cg']:
         sys.exit(f'try_readme: pip installed the commands {", ".join(ours)}; expected cg alone')
