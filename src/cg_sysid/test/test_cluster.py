@@ -192,8 +192,8 @@ def test_a_worker_killed_in_mid_run_changes_nothing(
         assert killed.result() in [process.pid for process in processes.running[1:]]
     assert_same(found, local)
     for what in dict.fromkeys(step[0] for step in steps):
-        counts = [(done, total) for name, done, total in steps if name == what]
-        assert counts == [(k + 1, len(counts)) for k in range(len(counts))], what
+        counts = [(done, total) for name, done, total, _ in steps if name == what]
+        assert counts == [(k, len(counts) - 1) for k in range(len(counts))], what
 
 
 def endless(marker):
@@ -237,7 +237,9 @@ def test_the_command_line_fits_on_the_cluster_and_can_be_interrupted(
         until(lambda: working(client))
         program.send_signal(signal.SIGINT)
         out, err = program.communicate(timeout=LONG)
-        assert (program.returncode, out, err) == (130, '', 'diagnose: interrupted\n')
+        # Before it there may be lines of progress.
+        assert (program.returncode, out) == (130, '')
+        assert err.splitlines()[-1] == 'cg diagnose: interrupted'
         until(lambda: not tasks(client))
         until(lambda: not working(client))
 
