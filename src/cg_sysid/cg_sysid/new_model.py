@@ -1,6 +1,6 @@
 """Command line: a commented model file to start from.
 
-    new_model MECHANISM > my_robot.yaml
+    cg new-model MECHANISM > my_robot.yaml
 
 The file loads as it is. It holds every key that this mechanism can have, with unit and range; its
 numbers are those of a model that comes along, to be replaced. docs/model_file.md is the reference.
@@ -152,7 +152,7 @@ def _entries(
 def parser() -> argparse.ArgumentParser:
     """The options."""
     made = argparse.ArgumentParser(
-        prog='new_model', description='Write a commented model file to start from.'
+        prog='cg new-model', description='Write a commented model file to start from.'
     )
     made.add_argument('mechanism', help=f'one of {", ".join(MECHANISMS)}')
     return made
@@ -160,7 +160,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run('new_model', work, parser().parse_args(args))
+    return cli.run('cg new-model', work, parser().parse_args(args))
 
 
 def work(options: argparse.Namespace) -> int:
