@@ -16,10 +16,10 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from cg_sysid import channels
+from cg_sysid.bag_file import BagWriter
 from cg_sysid.channels import IMU, NOTE_TOPIC, STRING, TORQUE_COMMAND, Topic
 from cg_sysid.errors import RecordingError
 from cg_sysid.raw import NOTE_FORMAT
@@ -69,7 +69,7 @@ def _write(path: Path, record: Record, commands: dict[str, Any]) -> None:
     if commands:
         series.append((mechanism.command, commands))
     first = int(record.stamp_ns[0])
-    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
+    with BagWriter(path) as bag:
         connection = bag.add_connection(
             NOTE_TOPIC, STRING, typestore=store, offered_qos_profiles=[LATCHED_QOS]
         )

@@ -18,18 +18,17 @@ from cg_description.reading import parse_yaml, read_text
 from cg_description.schema import Mapping as Form
 from cg_sysid import channels
 from cg_sysid.alignment import to_record
+from cg_sysid.bag_integrity import no_bag, require_sound, unfinished
 from cg_sysid.bag_writer import write_bag
 from cg_sysid.channels import NOTE_TOPIC, STRING, Topic
 from cg_sysid.errors import RecordingError
 from cg_sysid.raw import NOTE, RawRecording, RawTopic
 from cg_sysid.record import NS_PER_S, SHARED_ROW_NS, Record
-from cg_sysid.recover import needs_recovery
 
 __all__ = ['RawRecording', 'RawTopic', 'load_note', 'no_bag', 'parse_note', 'read_bag', 'read_raw',
            'to_record', 'write_bag']
 
-LOGS = ('.csv', '.mat', '.json')  # what an import is needed for
-MCAP_MAGIC = b'\x89MCAP0\r\n'
+LONGEST_REASON = 300  # characters of what a library says
 
 
 def read_bag(
@@ -68,59 +67,18 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
     if not path.exists():
         raise RecordingError(f'{path}: no such file or directory')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
-        raise _unfinished(path)
+        raise unfinished(path)
     if path.is_file() and path.suffix not in ('.mcap', '.db3'):
         raise no_bag(path)
+    require_sound(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             return _read_open(path, reader, note)
     except RecordingError:
         raise
     except Exception as error:  # every library below has its own kinds: translated here
-        if needs_recovery(path) and _begins_as_mcap(path):
-            raise _unfinished(path) from error
-        msg = f'{path}: not a readable rosbag2 recording ({type(error).__name__}: {error})'
-        raise RecordingError(msg) from error
-
-
-def no_bag(path: Path) -> RecordingError:
-    """The error of what is no bag; of a log, with the way to make bags of it."""
-    logs = [path] if path.is_file() else sorted(path.glob('*.*'))
-    if any(log.suffix.lower() in LOGS for log in logs):
-        kind = 'a log' if path.is_file() else 'a folder of logs'
-        folder = path.parent if path.is_file() else path
-        return RecordingError(
-            f'{path}: {kind}, no bag; a mapping file says which column is which channel, then '
-            f'`cg import MAPPING.yaml {folder} --out bags` makes bags of it '
-            '(docs/data.md, "Import of foreign logs")'
-        )
-    return RecordingError(
-        f'{path}: not a bag; a directory with metadata.yaml and .mcap or .db3 files is needed'
-    )
-
-
-def _unfinished(path: Path) -> RecordingError:
-    """The error of a recording whose end was never written, with the way out."""
-    if needs_recovery(path) and _begins_as_mcap(path):
-        way_out = f'python3 -m cg_sysid.recover {path}'
-    elif path.is_dir() and any(path.glob('*.db3*')):
-        way_out = f'ros2 bag reindex {path}'
-    else:
-        return no_bag(path)
-    return RecordingError(
-        f'{path}: the recording was cut off (its index or metadata.yaml is missing); '
-        f'rebuild it with: {way_out}'
-    )
-
-
-def _begins_as_mcap(path: Path) -> bool:
-    """Whether there is something to recover at all."""
-    files = path.glob('*.mcap') if path.is_dir() else [path]
-    for file in files:
-        with file.open('rb') as stream:
-            if stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
-                return True
-    return False
+        what = ' '.join(f'{type(error).__name__}: {error}'.split())[:LONGEST_REASON]
+        raise RecordingError(f'{path}: not a readable rosbag2 recording ({what})') from error
 
 
 def _read_open(

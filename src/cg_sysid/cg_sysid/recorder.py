@@ -2,15 +2,19 @@
 
 While it runs, a recording is a directory that holds a journal (journal.py). `close` turns it
 into an ordinary rosbag2 directory; `recover.py` does the same for one that was never closed.
+
+A recording that starts while data already flow hears the topics one after the other. Everything
+is written, and the journal notes where the last of the expected topics began: the bag begins
+there, unless all of them began with the same stamp.
 """
 
 import shutil
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from cg_dynamics.settings import Settings, setting
@@ -38,6 +42,12 @@ class RecorderSettings(Settings):
         'receipt',
         'log time of a message: when it was received, or its own stamp (lock-step)',
         choices=('receipt', 'stamp'),
+    )
+    patience: float = setting(
+        5.0,
+        'longest wait, from the first sample on, for topics that have not begun',
+        unit='s',
+        minimum=0.0,
     )
     depth: int = setting(
         2000, 'messages of one topic that may wait to be stored', minimum=10, maximum=100000
@@ -71,8 +81,13 @@ def topics_to_record(settings: RecorderSettings) -> dict[str, str]:
 
 def needed_topics(settings: RecorderSettings) -> tuple[str, ...]:
     """Topics that must have a publisher before the recorder calls itself ready."""
+    return (NOTE_TOPIC, *expected_topics(settings))
+
+
+def expected_topics(settings: RecorderSettings) -> tuple[str, ...]:
+    """Topics of which every sample counts: a recording begins when all of them have begun."""
     mechanism = MECHANISMS[settings.mechanism]
-    topics = [NOTE_TOPIC, mechanism.torque.name, *(topic.name for topic in mechanism.outputs)]
+    topics = [mechanism.torque.name, *(topic.name for topic in mechanism.outputs)]
     topics += EXTRA_TOPICS.get(settings.mechanism, {})
     if settings.time == 'stamp':
         topics.append(mechanism.command.name)
@@ -93,6 +108,8 @@ class RecordedTopic:
     stamped: bool
     count: int = 0
     newest_ns: int = 0
+    first_stamp_ns: int = 0
+    first_log_ns: int = 0
 
 
 class Recording:
@@ -101,15 +118,25 @@ class Recording:
     Attributes:
         path: The bag directory.
         messages: Messages stored so far.
+        begun: Whether it is known where the bag begins.
     """
 
-    def __init__(self, path: Path, topics: dict[str, str], by_stamp: bool):
+    def __init__(
+        self,
+        path: Path,
+        topics: dict[str, str],
+        by_stamp: bool,
+        expected: tuple[str, ...] = (),
+        status: Mapping[str, Any] | None = None,
+    ):
         """Create the directory and the journal in it.
 
         Args:
             path: The bag directory, which must not exist yet.
             topics: Topic name -> message type.
             by_stamp: Log messages at their own stamps instead of their receipt.
+            expected: Topics that must have begun where the bag begins.
+            status: What else the journal shall hold (journal.py).
 
         Raises:
             ValueError: There is no path, or something is there already.
@@ -121,24 +148,57 @@ class Recording:
         path.mkdir(parents=True)
         self.path = path
         self.messages = 0
+        self.begun = False
         self._types = topics
         self._by_stamp = by_stamp
+        self._expected = expected
         self._journal = Journal(path / JOURNAL_NAME)
         self._topics: dict[str, RecordedTopic] = {}
         self._waiting: list[tuple[str, bytes]] = []
         self._first_ns: int | None = None
+        self._status = {**(status or {}), 'expected': list(expected), 'qos': {}}
 
     def knows(self, topic: str) -> bool:
         """Whether the topic has been announced."""
         return topic in self._topics
 
     def announce(self, topic: str, qos_profiles: list[dict[str, Any]]) -> None:
-        """Open a channel for the topic, with the QoS that its publishers offer."""
+        """Open a channel for the topic, and note the QoS that its publishers offer."""
         msgtype = self._types[topic]
         definition, _ = TYPESTORE.generate_msgdef(msgtype, ros_version=2)
-        metadata = {'offered_qos_profiles': yaml.safe_dump(qos_profiles) if qos_profiles else ''}
-        channel = self._journal.add_channel(topic, msgtype, definition, metadata)
+        channel = self._journal.add_channel(topic, msgtype, definition)
         self._topics[topic] = RecordedTopic(channel, is_stamped(msgtype))
+        self._status['qos'][topic] = qos_profiles
+        self._journal.set_status(self._status, 0)
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """Expected topics that have not begun."""
+        return tuple(
+            name
+            for name in self._expected
+            if name not in self._topics or self._topics[name].count == 0
+        )
+
+    def begin(self) -> int:
+        """Say where the bag begins: where the last of the topics did that are heard by now.
+
+        If all expected topics began with the same stamp, nothing was missed, and everything is
+        kept. So it is if some are silent: then what there is counts.
+
+        Returns:
+            The log time where the bag begins in ns; 0 if everything is kept.
+        """
+        expected = [self._topics[name] for name in self._expected if name in self._topics]
+        begin_ns = 0
+        if not self.silent and len({topic.first_stamp_ns for topic in expected}) > 1:
+            begin_ns = max(
+                topic.first_log_ns for name, topic in self._topics.items() if name != NOTE_TOPIC
+            )
+        self.begun = True
+        self._status['begin_ns'] = begin_ns
+        self._journal.set_status(self._status, begin_ns)
+        return begin_ns
 
     def write(self, topic: str, data: bytes, receipt_ns: int, now: float) -> None:
         """Store one serialised message of an announced topic.
@@ -147,12 +207,12 @@ class Recording:
             topic: Its name.
             data: The message in CDR.
             receipt_ns: When it came in, in ns of the clock that the bag is to show.
-            now: Monotonic time in s, by which chunks are closed.
+            now: Monotonic time in s.
         """
         recorded = self._topics[topic]
         if recorded.stamped:
             seconds, nanoseconds = STAMP.unpack_from(data, HEADER_OFFSET)
-            stamp_ns = seconds * 1_000_000_000 + nanoseconds
+            stamp_ns = max(seconds * 1_000_000_000 + nanoseconds, 0)
             if self._by_stamp and stamp_ns <= recorded.newest_ns:
                 return  # lock-step repeats its first sample until somebody answers
             recorded.newest_ns = max(recorded.newest_ns, stamp_ns)
@@ -170,13 +230,12 @@ class Recording:
             for early_topic, early_data in waiting:
                 self.write(early_topic, early_data, receipt_ns, now)
         log_ns = stamp_ns if self._by_stamp else receipt_ns
-        self._journal.write(recorded.channel, recorded.count, log_ns, stamp_ns, data, now)
+        if recorded.count == 0:
+            recorded.first_stamp_ns, recorded.first_log_ns = stamp_ns, log_ns
+        self._journal.write(recorded.channel, recorded.count, log_ns, stamp_ns, data)
+        self._journal.repeat_if_due(log_ns, now)
         recorded.count += 1
         self.messages += 1
-
-    def flush_if_due(self, now: float) -> float:
-        """Hand old messages to the operating system; return the s until that is due again."""
-        return self._journal.flush_if_due(now)
 
     @property
     def complete_until_ns(self) -> int:
@@ -189,9 +248,10 @@ class Recording:
         if self.messages == 0 and not self._waiting:
             self._journal.close()
             shutil.rmtree(self.path)
-            return Recovered(self.path, 0, '')
+            return Recovered(self.path, 0)
         for topic, data in self._waiting:
             recorded = self._topics[topic]
-            self._journal.write(recorded.channel, recorded.count, 0, 0, data, 0.0)
+            self._journal.write(recorded.channel, recorded.count, 0, 0, data)
+            recorded.count += 1
         self._journal.close()
         return recover(self.path)

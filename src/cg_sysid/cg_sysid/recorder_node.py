@@ -1,14 +1,13 @@
 """ROS node of the recorder: raw subscriptions into a bag. What is on disk: recorder.py.
 
-A SIGKILL at any moment loses the last 10 ms or so; `cg recover BAG` makes a bag
-of the rest. SIGINT and SIGTERM close the bag properly.
-
-in    the sensor and torque topics of `mechanism`, /experiment, and those of `also`
-out   /recorder/progress
+A message is written when it comes in. A SIGKILL loses what had not come in; `ros2 run cg_sysid
+recover BAG` makes a bag of the rest. SIGINT and SIGTERM close the bag properly.
 """
 
+import contextlib
 import functools
 import importlib
+import os
 import time
 from pathlib import Path
 
@@ -18,11 +17,19 @@ from std_msgs.msg import Header
 
 from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run, to_stamp
 from cg_sysid.channels import NOTE_TOPIC
-from cg_sysid.recorder import RecorderSettings, Recording, needed_topics, topics_to_record
+from cg_sysid.recorder import (
+    RecorderSettings,
+    Recording,
+    expected_topics,
+    needed_topics,
+    topics_to_record,
+)
 
 PROGRESS_TOPIC = '/recorder/progress'
 PROGRESS_PERIOD = 0.002  # s
 READY_PERIOD = 0.02  # s
+SETTLING = 0.5  # s that topics which need not speak are given to begin
+NICENESS = -15  # far before ordinary work, behind nothing that keeps a machine alive
 
 
 class RecorderNode(Node):
@@ -36,9 +43,18 @@ class RecorderNode(Node):
         self.exit_status = 0
         settings = DeclaredSettings(self, RecorderSettings).values
         topics = topics_to_record(settings)
+        self.expected = expected_topics(settings)
         self.recording = Recording(
-            Path(settings.bag).expanduser(), topics, settings.time == 'stamp'
+            Path(settings.bag).expanduser(),
+            topics,
+            settings.time == 'stamp',
+            self.expected,
+            {'niceness': os.nice(0)},
         )
+        self.patience = settings.patience
+        self._first_sample_at: float | None = None
+        self._note_heard = False
+        self._look_at = 0.0
         # Waiting messages of all topics share one thread; the depth rides out a busy machine.
         qos = QoSProfile(depth=settings.depth, reliability=ReliabilityPolicy.RELIABLE)
         self.progress = self.create_publisher(Header, PROGRESS_TOPIC, SENSOR_QOS)
@@ -55,7 +71,9 @@ class RecorderNode(Node):
                 LATCHED_QOS if topic == NOTE_TOPIC else qos,
                 raw=True,
             )
-        self.get_logger().info(f'recording {len(topics)} topics to {self.recording.path}')
+        self.get_logger().info(
+            f'{self.recording.path}: waiting until all of {", ".join(self.needed)} are heard'
+        )
 
     def on_message(self, topic: str, serialised: bytes) -> None:
         """Store a message."""
@@ -63,25 +81,36 @@ class RecorderNode(Node):
             return
         try:
             if not self.recording.knows(topic):
-                self.recording.announce(topic, self._offered_qos(topic))
+                self._begin_topic(topic)
             self.recording.write(topic, serialised, time.time_ns(), time.monotonic())
         except OSError as error:
             self._fail(error)
 
+    def _begin_topic(self, topic: str) -> None:
+        self.recording.announce(topic, self._offered_qos(topic))
+        if topic == NOTE_TOPIC:
+            self._note_heard = True
+        elif self._first_sample_at is None:
+            self._first_sample_at = time.monotonic()
+        if self.recording.begun and topic in self.needed:
+            self.get_logger().warning(f'{topic} began late')
+
     def poll(self) -> float:
-        """Close chunks that are old enough, tell how far the recording has come."""
+        """Begin when everything is heard, tell how far the recording has come."""
         now = time.monotonic()
         if self.finished:
             return 0.0
-        try:
-            wait = self.recording.flush_if_due(now)
-        except OSError as error:
-            self._fail(error)
-            return 0.0
+        if not self.recording.begun and now >= self._look_at:
+            self._look_at = now + READY_PERIOD
+            try:
+                self._begin_if_heard(now)
+            except OSError as error:
+                self._fail(error)
+                return 0.0
         stored_ns = self.recording.complete_until_ns
         if stored_ns == 0:
             # Until the first sample, a progress of zero says that this recorder hears everything.
-            if now > self._told_at + READY_PERIOD and self._hears_all():
+            if now > self._told_at + READY_PERIOD and self._note_heard and self._hears_all():
                 self._told_at = now
                 self.progress.publish(self._progress)
         elif stored_ns != self._told_ns:
@@ -90,7 +119,46 @@ class RecorderNode(Node):
             self._told_ns, self._told_at = stored_ns, now
             self._progress.stamp = to_stamp(stored_ns)
             self.progress.publish(self._progress)
-        return wait
+        return READY_PERIOD
+
+    def _begin_if_heard(self, now: float) -> None:
+        """Once samples come: begin when nothing is missing, or when patience ends."""
+        if self._first_sample_at is None:
+            return
+        missing = list(self.recording.silent)
+        if not self._note_heard:
+            missing.append(NOTE_TOPIC)
+        missing += [topic for topic in self._unmatched() if topic not in missing]
+        waited = now - self._first_sample_at
+        if missing and waited < self.patience:
+            return
+        if self._quiet() and waited < min(SETTLING, self.patience):
+            return
+        if missing:
+            self.recording.begin()
+            self.get_logger().warning(
+                f'recording begins after {waited:.3f} s without {", ".join(missing)}; the bag '
+                'tells how late they begin'
+            )
+            return
+        begin_ns = self.recording.begin()
+        left_out = '; what came before the last of them began is left out' if begin_ns else ''
+        self.get_logger().info(f'all topics are heard, {waited:.3f} s after the first{left_out}')
+
+    def _unmatched(self) -> list[str]:
+        """Topics of which a publisher is known that no subscription hears yet."""
+        return [
+            topic
+            for topic, subscription in self.subscriptions_to.items()
+            if subscription.get_publisher_count() < self.count_publishers(topic)
+        ]
+
+    def _quiet(self) -> bool:
+        """Whether a topic has a publisher and has said nothing yet."""
+        return any(
+            subscription.get_publisher_count() and not self.recording.knows(topic)
+            for topic, subscription in self.subscriptions_to.items()
+        )
 
     def _hears_all(self) -> bool:
         # Asked of the readers: a writer that has matched a reader may not be matched by it yet.
@@ -113,8 +181,10 @@ class RecorderNode(Node):
             return
         if result.messages == 0:
             self.get_logger().warning('nothing was recorded, no bag is left')
-        else:
-            self.get_logger().info(f'{result.messages} messages in {result.path}')
+            return
+        self.get_logger().info(f'{result.messages} messages in {result.path}')
+        for line in result.remarks:
+            self.get_logger().warning(line)
 
 
 def message_class(msgtype: str) -> type:
@@ -154,7 +224,10 @@ def qos_entry(profile: QoSProfile) -> dict:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_sysid recorder_node`."""
-    return run(RecorderNode, RecorderSettings, args)
+    # Before anything starts a thread: threads inherit it. An ordinary user may not; so be it.
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    return run(RecorderNode, args)
 
 
 if __name__ == '__main__':

@@ -1,41 +1,100 @@
-"""Make an ordinary bag of what a recording left on disk, complete or killed. Pure; no ROS.
+"""Make an ordinary bag of what a recording left on disk, complete, killed or damaged. No ROS.
 
-`cg recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
-the journals of this project's recorder, and on any MCAP bag whose writer died: everything up to
-the first damaged record is kept. The bag is complete on disk at every moment: the new file
-replaces the old one in one step, and metadata.yaml comes last.
+`ros2 run cg_sysid recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
+the journals of this project's recorder, and on any MCAP bag whose writer died or that was damaged
+later: everything intact is kept, before and after the damage, and what was lost is told. The bag
+is complete on disk at every moment: the new file replaces the old one in one step, and
+metadata.yaml comes last. A damaged file stays beside it, as `NAME.damaged`.
 """
 
 import argparse
 import contextlib
+import functools
 import heapq
+import json
+import os
 import shutil
-import struct
 import sys
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+import yaml
+from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from cg_sysid.bag_file import BagWriter
+from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
+from cg_sysid.journal import STATUS_TOPIC, TYPE_KEY
+from cg_sysid.mcap_scan import MAGIC, Gap, Survey, messages, survey
 
 from cg_sysid.progress import Bars
 
 JOURNAL_NAME = 'journal.mcap'
 WORK_NAME = '.recovering'
-MAGIC = b'\x89MCAP0\r\n'
 METADATA = 'metadata.yaml'
+DAMAGED = '.damaged'
 REORDER_NS = 1_000_000_000  # messages are sorted by log time within this horizon
+LATE_NS = 20_000_000  # what is later than this is told in the bag
+LARGEST_QOS = 8192  # characters of offered QoS profiles; a profile takes 350
+LOSSES_SHOWN = 20
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+# For a journal or bag in which every copy of a schema is damaged.
+KNOWN_TYPES = {NOTE_TOPIC: STRING} | {
+    topic.name: topic.msgtype
+    for mechanism in MECHANISMS.values()
+    for topic in mechanism.topics.values()
+}
 
 
 class RecoveryError(ValueError):
     """A path that holds nothing to recover; the message says what is there instead."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A damaged place of a file.
+
+    Attributes:
+        file: Name of the file.
+        start: First byte that is lost.
+        stop: The byte after the last.
+        reason: What is wrong there.
+        from_ns: Log time of the newest message before it; 0 without one.
+        until_ns: Log time of the next message after it; 0 without one.
+        messages: Topic -> messages that are missing there, where they are numbered.
+        estimate: Messages that are missing there.
+    """
+
+    file: str
+    start: int
+    stop: int
+    reason: str
+    from_ns: int
+    until_ns: int
+    messages: dict[str, int]
+    estimate: int
+
+    def __str__(self) -> str:
+        place = f'{self.file}, bytes {self.start} to {self.stop}: {self.reason}'
+        if not self.estimate:
+            return f'{place}; no message lost'
+        topics = ', '.join(f'{n} of {topic}' for topic, n in sorted(self.messages.items()))
+        about = f' ({topics})' if topics else ''
+        return f'{place}; about {self.estimate} messages lost{about}{self._when()}'
+
+    def _when(self) -> str:
+        begin, end = f'{1e-9 * self.from_ns:.3f} s', f'{1e-9 * self.until_ns:.3f} s'
+        if self.from_ns and self.until_ns:
+            return f', from {begin} to {end}'
+        if self.from_ns or self.until_ns:
+            return f', after {begin}' if self.from_ns else f', before {end}'
+        return ''
 
 
 @dataclass(frozen=True)
@@ -45,12 +104,47 @@ class Recovered:
     Attributes:
         path: The bag directory.
         messages: Messages in it.
-        damage: What ended the reading of a damaged file; empty for a journal that just ends.
+        losses: Damaged places.
+        undecodable: Topic -> messages left out because they do not decode.
+        left_out: Messages from before all expected topics had begun.
+        began_late: Expected topic -> s by which it began after the bag; None: never.
+        received_late: Topic -> longest time in s that a message took, over the shortest.
     """
 
     path: Path
     messages: int
-    damage: str
+    losses: tuple[Loss, ...] = ()
+    undecodable: dict[str, int] = field(default_factory=dict)
+    left_out: int = 0
+    began_late: dict[str, float | None] = field(default_factory=dict)
+    received_late: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def damage(self) -> tuple[str, ...]:
+        """What was lost and where, a line for each place; empty for a file that just ends."""
+        lines = [str(loss) for loss in self.losses[:LOSSES_SHOWN]]
+        if len(self.losses) > LOSSES_SHOWN:
+            rest = self.losses[LOSSES_SHOWN:]
+            count = sum(loss.estimate for loss in rest)
+            lines.append(f'{len(rest)} more damaged places, about {count} messages lost')
+        lines += [
+            f'{count} messages of {topic} do not decode and are left out'
+            for topic, count in sorted(self.undecodable.items())
+        ]
+        return tuple(lines)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the bag should know, a line each."""
+        late = [
+            f'{topic} never began' if delay is None else f'{topic} began {delay:.3f} s late'
+            for topic, delay in self.began_late.items()
+        ]
+        late += [
+            f'{topic} was received up to {delay:.3f} s late'
+            for topic, delay in self.received_late.items()
+        ]
+        return (*self.damage, *late)
 
 
 class Entry(NamedTuple):
@@ -62,12 +156,34 @@ class Entry(NamedTuple):
     data: bytes
 
 
-class Kind(NamedTuple):
-    """What a bag must know of a topic."""
+@dataclass
+class Topic:
+    """What a bag must know of a topic, and what became of its messages."""
 
+    name: str
     msgtype: str
-    msgdef: str
-    qos: str
+    store: Typestore
+    qos: list[Qos]
+    count: int = 0
+    undecodable: int = 0
+    first_ns: int = 0
+    delays: tuple[int, int] | None = None  # shortest and longest, ns
+
+    def note_delay(self, delay: int) -> None:
+        """Take in how long after its stamp a message was received, in ns."""
+        low, high = self.delays or (delay, delay)
+        self.delays = min(low, delay), max(high, delay)
+
+
+@dataclass
+class Contents:
+    """What the files of a recording hold, and what is found while it is read."""
+
+    surveys: list[Survey]
+    topics: dict[str, Topic] = field(default_factory=dict)
+    status: dict[str, Any] = field(default_factory=dict)
+    unknown: Counter[str] = field(default_factory=Counter)
+    left_out: int = 0
 
 
 def needs_recovery(path: str | Path) -> bool:
@@ -81,6 +197,13 @@ def needs_recovery(path: str | Path) -> bool:
     return path.suffix == '.mcap' and path.is_file() and _is_cut_off(path)
 
 
+def is_damaged(path: str | Path) -> bool:
+    """Whether a bag directory or MCAP file needs recovery, or is damaged inside."""
+    path = Path(path)
+    files = path.glob('*.mcap') if path.is_dir() else [path]
+    return needs_recovery(path) or any(not survey(file).sound for file in files)
+
+
 def _is_cut_off(file: Path) -> bool:
     size = file.stat().st_size
     if size < 2 * len(MAGIC):
@@ -91,7 +214,7 @@ def _is_cut_off(file: Path) -> bool:
 
 
 def recover(path: str | Path) -> Recovered:
-    """Make an ordinary bag of a directory that was never closed, in place.
+    """Make an ordinary bag of a directory that was never closed or is damaged, in place.
 
     Of a single MCAP file, a directory of the file's name is made beside it.
 
@@ -108,15 +231,24 @@ def recover(path: str | Path) -> Recovered:
         sources, target = _sources(path), path
     else:
         raise RecoveryError(f'{path} is neither a bag directory nor an .mcap file')
-    kinds: dict[str, Kind] = {}
-    damage: list[str] = []
-    entries = _sorted(_messages(sources, kinds, damage))
     work = target / WORK_NAME
     shutil.rmtree(work, ignore_errors=True)
     # rosbags names the file after the directory, and the file carries that name in its metadata.
     staged = work / target.resolve().name
-    count = _write(staged, entries, kinds)
-    return _replace(target, staged, sources, Recovered(target, count, '; '.join(damage)))
+    try:
+        result = _make(staged, sources, target)
+        if result.messages == 0:
+            reasons = '; '.join(result.damage)
+            raise RecoveryError(
+                f'{path} holds no message that can be read' + (f': {reasons}' if reasons else '')
+            )
+        _replace(target, staged, sources, damaged=bool(result.damage))
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            if target != path:
+                target.rmdir()  # of a single file that gave nothing
+    return result
 
 
 def _sources(path: Path) -> list[Path]:
@@ -129,103 +261,263 @@ def _sources(path: Path) -> list[Path]:
     return files
 
 
-def _messages(sources: list[Path], kinds: dict[str, Kind], damage: list[str]) -> Iterator[Entry]:
-    """Every message up to the first damage of each file; fills `kinds` and `damage` on the way."""
-    counts: dict[str, int] = {}
-    for source in sources:
-        schemas: dict[int, Schema] = {}
-        topics: dict[int, str] = {}
-        try:
-            for record in _records(source):
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    schema = schemas[record.schema_id]
-                    topics[record.id] = record.topic
-                    kinds[record.topic] = Kind(
-                        schema.name,
-                        schema.data.decode(),
-                        record.metadata.get('offered_qos_profiles', ''),
-                    )
-                elif isinstance(record, Message):
-                    topic = topics[record.channel_id]
-                    counts[topic] = counts.get(topic, 0) + 1
-                    yield Entry(record.log_time, topic, counts[topic], record.data)
-        except (McapError, EOFError, struct.error, zstandard.ZstdError, KeyError) as error:
-            damage.append(f'{source.name}: {type(error).__name__} {error}'.rstrip())
+def _make(staged: Path, sources: list[Path], target: Path) -> Recovered:
+    contents = Contents([survey(source) for source in sources])
+    _learn_status(contents)
+    writer = BagWriter(staged)
+    with writer:
+        begun, count = _write(writer, contents)
+        # Only now is everything known; metadata.yaml is written at the end.
+        result = _result(target, contents, begun, count)
+        for key, value in _custom_data(result).items():
+            writer.set_custom_data(key, value)
+    return result
 
 
-def _records(source: Path) -> Iterator[object]:
-    size = source.stat().st_size
-    with source.open('rb') as stream:
-        for record in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
-            if isinstance(record, Chunk):
-                yield from breakup_chunk(record, validate_crc=True)
-            elif isinstance(record, Footer):
-                return
-            else:
-                yield record
-            if stream.tell() == size:
-                return
+def _learn_status(contents: Contents) -> None:
+    """The newest status of the recorder (journal.py)."""
+    for found in contents.surveys:
+        if not any(channel.topic == STATUS_TOPIC for channel in found.channels.values()):
+            continue
+        for message in messages(found):
+            if found.channels[message.channel].topic == STATUS_TOPIC and message.trusted:
+                with contextlib.suppress(ValueError, RecursionError):
+                    contents.status = dict(json.loads(message.data))
 
 
-def _sorted(messages: Iterator[Entry]) -> Iterator[Entry]:
+def _entries(contents: Contents) -> Iterator[Entry]:
+    """Every intact message of known type from where the bag begins on."""
+    begin_ns = contents.status.get('begin_ns') or 0
+    for found in contents.surveys:
+        topics = _topics(found, contents)
+        for message in messages(found):
+            topic = topics.get(message.channel)
+            if topic is None:
+                if not _is_status(found, message.channel):
+                    contents.unknown[_name_of(found, message.channel)] += 1
+                continue
+            if not message.trusted and not _decodes(topic, message.data):
+                topic.undecodable += 1
+                continue
+            log_ns = message.log_ns
+            if log_ns < begin_ns:
+                if topic.name != NOTE_TOPIC:
+                    contents.left_out += 1
+                    continue
+                log_ns = begin_ns  # it is latched: what it says still holds
+            if topic.count == 0 or log_ns < topic.first_ns:
+                topic.first_ns = log_ns
+            topic.note_delay(message.log_ns - message.publish_ns)
+            topic.count += 1
+            yield Entry(log_ns, topic.name, topic.count, message.data)
+
+
+def _is_status(found: Survey, channel: int) -> bool:
+    return channel in found.channels and found.channels[channel].topic == STATUS_TOPIC
+
+
+def _name_of(found: Survey, channel: int) -> str:
+    if channel in found.channels:
+        return found.channels[channel].topic
+    return f'channel {channel}, whose topic is not known'
+
+
+def _topics(found: Survey, contents: Contents) -> dict[int, Topic]:
+    """Channel -> topic, of those whose message type is known."""
+    known = {}
+    for number, channel in found.channels.items():
+        if channel.topic == STATUS_TOPIC:
+            continue
+        schema = found.schemas.get(channel.schema)
+        metadata = dict(channel.metadata)
+        msgtype = metadata.get(TYPE_KEY) or (
+            schema.name if schema else KNOWN_TYPES.get(channel.topic, '')
+        )
+        trusted = schema is not None and schema.trusted and schema.name == msgtype
+        definition = schema.definition if schema and schema.name == msgtype else ''
+        store = _store_of(msgtype, definition, trusted)
+        if store is None:
+            continue
+        topic = contents.topics.get(channel.topic)
+        if topic is None:
+            qos = contents.status.get('qos', {}).get(channel.topic)
+            topic = Topic(
+                channel.topic,
+                msgtype,
+                store,
+                _qos(qos if qos is not None else metadata.get('offered_qos_profiles', '')),
+            )
+            contents.topics[channel.topic] = topic
+        if topic.msgtype == msgtype:
+            known[number] = topic
+    return known
+
+
+def _store_of(msgtype: str, definition: str, trusted: bool) -> Typestore | None:
+    """A type store that knows this message type; None if nothing tells what it is."""
+    if msgtype in JAZZY.fielddefs and not trusted:
+        return JAZZY
+    return _parsed(msgtype, definition) or (JAZZY if msgtype in JAZZY.fielddefs else None)
+
+
+@functools.lru_cache(maxsize=256)
+def _parsed(msgtype: str, definition: str) -> Typestore | None:
+    """A type store with this message type; None if the definition cannot be used."""
+    if msgtype in JAZZY.fielddefs and definition == _definition_of(JAZZY, msgtype):
+        return JAZZY
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition, msgtype))
+        _definition_of(store, msgtype)
+        store.hash_rihs01(msgtype)
+    except Exception:  # the parser below has its own kinds, and asserts
+        return None
+    return store
+
+
+@functools.lru_cache(maxsize=256)
+def _definition_of(store: Typestore, msgtype: str) -> str:
+    return store.generate_msgdef(msgtype, ros_version=2)[0]
+
+
+def _decodes(topic: Topic, data: bytes) -> bool:
+    try:
+        topic.store.deserialize_cdr(data, topic.msgtype)
+    except Exception:  # the generated decoders raise what comes
+        return False
+    return True
+
+
+def _qos(profiles: Any) -> list[Qos]:
+    """Offered QoS, from a list or YAML text; none if it is not what it should be."""
+    try:
+        if isinstance(profiles, str):
+            # Nothing that anybody offers is nested deeper, or refers to itself.
+            if len(profiles) > LARGEST_QOS or profiles.count('- -') or '&' in profiles:
+                return []
+            if profiles.count('[') + profiles.count('{') > LARGEST_QOS // 100:
+                return []
+            profiles = yaml.safe_load(profiles)
+        return parse_qos(list(profiles or []))
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return []
+
+
+def _sorted(entries: Iterator[Entry]) -> Iterator[Entry]:
     """By log time, then topic, then order of arrival; the same for every order of arrival."""
     heap: list[Entry] = []
     newest = 0
-    for message in messages:
-        heapq.heappush(heap, message)
-        newest = max(newest, message.log_ns)
+    for entry in entries:
+        heapq.heappush(heap, entry)
+        newest = max(newest, entry.log_ns)
         while heap[0].log_ns < newest - REORDER_NS:
             yield heapq.heappop(heap)
     while heap:
         yield heapq.heappop(heap)
 
 
-def _write(path: Path, entries: Iterator[Entry], kinds: dict[str, Kind]) -> int:
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    connections = {}
-    count = 0
-    with writer:
-        for entry in entries:
-            if entry.topic not in connections:
-                kind = kinds[entry.topic]
-                if kind.msgtype not in typestore.fielddefs:
-                    typestore.register(get_types_from_msg(kind.msgdef, kind.msgtype))
-                connections[entry.topic] = writer.add_connection(
-                    entry.topic,
-                    kind.msgtype,
-                    msgdef=kind.msgdef,
-                    rihs01=typestore.hash_rihs01(kind.msgtype),
-                    offered_qos_profiles=parse_qos(kind.qos),
-                )
-            writer.write(connections[entry.topic], entry.log_ns, entry.data)
-            count += 1
-    return count
+def _write(writer: BagWriter, contents: Contents) -> tuple[int, int]:
+    """Write every message; return the first log time and the count."""
+    connections: dict[str, Connection] = {}
+    count, begun = 0, 0
+    for entry in _sorted(_entries(contents)):
+        if entry.topic not in connections:
+            connections[entry.topic] = _connection(writer, contents.topics[entry.topic])
+        writer.write(connections[entry.topic], entry.log_ns, entry.data)
+        begun = begun if count else entry.log_ns
+        count += 1
+    return begun, count
 
 
-def _replace(target: Path, staged: Path, sources: list[Path], result: Recovered) -> Recovered:
-    if result.messages == 0:
-        shutil.rmtree(staged.parent)
-        raise RecoveryError(f'{target} holds no message that can be read')
+def _connection(writer: BagWriter, topic: Topic) -> Connection:
+    return writer.add_connection(
+        topic.name,
+        topic.msgtype,
+        msgdef=_definition_of(topic.store, topic.msgtype),
+        rihs01=topic.store.hash_rihs01(topic.msgtype),
+        offered_qos_profiles=topic.qos,
+    )
+
+
+def _result(target: Path, contents: Contents, begun: int, count: int) -> Recovered:
+    topics = contents.topics.values()
+    undecodable = {topic.name: topic.undecodable for topic in topics if topic.undecodable}
+    undecodable.update(contents.unknown)
+    late: dict[str, float | None] = {}
+    for name in contents.status.get('expected', ()):
+        topic = contents.topics.get(name)
+        if topic is None or topic.count == 0:
+            late[name] = None
+        elif topic.first_ns - begun > LATE_NS:
+            late[name] = 1e-9 * (topic.first_ns - begun)
+    slow = {
+        topic.name: 1e-9 * (topic.delays[1] - topic.delays[0])
+        for topic in topics
+        if topic.delays and topic.delays[1] - topic.delays[0] > LATE_NS
+    }
+    losses = tuple(
+        _loss(found, gap) for found in contents.surveys for gap in found.gaps
+    )
+    return Recovered(target, count, losses, undecodable, contents.left_out, late, slow)
+
+
+def _loss(found: Survey, gap: Gap) -> Loss:
+    named = {
+        _name_of(found, channel): count
+        for channel, count in gap.missing.items()
+        if not _is_status(found, channel)
+    }
+    if found.numbered and gap.until_ns:
+        estimate = sum(named.values())
+    elif gap.lost:
+        estimate = round(min((gap.stop - gap.start) / found.bytes_per_message, 1e12))
+    else:
+        estimate = 0
+    return Loss(
+        found.path.name, gap.start, gap.stop, gap.reason, gap.from_ns, gap.until_ns, named,
+        estimate,
+    )  # fmt: skip
+
+
+def _custom_data(result: Recovered) -> dict[str, str]:
+    """What metadata.yaml tells of the recording beside what rosbag2 does; empty if all is well."""
+    told = {
+        'damage': list(result.damage),
+        'began_late': result.began_late,
+        'received_late': result.received_late,
+    }
+    return {key: json.dumps(value) for key, value in told.items() if value}
+
+
+def _replace(target: Path, staged: Path, sources: list[Path], damaged: bool) -> None:
     mcap = target / f'{staged.name}.mcap'
     (target / METADATA).unlink(missing_ok=True)
+    if damaged:
+        for source in sources:
+            if source.parent == target:
+                _keep(source, source.with_name(source.name + DAMAGED))
     (staged / mcap.name).replace(mcap)
     for source in sources:
         if source.parent == target and source != mcap:
-            source.unlink()
+            source.unlink(missing_ok=True)
     (staged / METADATA).replace(target / METADATA)
-    with contextlib.suppress(OSError):
-        shutil.rmtree(staged.parent)
-    return result
+
+
+def _keep(source: Path, copy: Path) -> None:
+    """Give a file a second name; one that is there already is older and stays."""
+    if copy.exists():
+        return
+    try:
+        os.link(source, copy)
+    except OSError:  # a file system without links
+        shutil.copy2(source, copy)
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `cg recover`."""
     parser = argparse.ArgumentParser(
-        prog='cg recover', description='Make an ordinary bag of a recording that was cut off.'
+        prog='recover',
+        description='Make an ordinary bag of a recording that was cut off or damaged.',
     )
     parser.add_argument('bag', nargs='+', help='bag directory or .mcap file')
     parser.add_argument(
@@ -233,20 +525,19 @@ def main(args: list[str] | None = None) -> int:
     )
     status = 0
     options = parser.parse_args(args)
-    for done, bag in enumerate(options.bag):
-        if Path(bag).exists() and not options.force and not needs_recovery(bag):
-            print(f'{bag}: nothing to recover')
-            continue
+    for bag in options.bag:
         try:
-            with Bars('cg recover') as bars:
-                bars(f'recovering {bag}', done, len(options.bag))
-                result = recover(bag)
+            if Path(bag).exists() and not options.force and not is_damaged(bag):
+                print(f'{bag}: nothing to recover')
+                continue
+            result = recover(bag)
         except (RecoveryError, OSError) as error:
             print(f'error: {error}', file=sys.stderr)
             status = 1
             continue
-        lost = f'; the file ended in a damaged record ({result.damage})' if result.damage else ''
-        print(f'{result.path}: {result.messages} messages recovered{lost}')
+        print(f'{result.path}: {result.messages} messages recovered')
+        for line in result.remarks:
+            print(f'  {line}')
     return status
 
 

@@ -1,0 +1,673 @@
+"""What is intact in an MCAP file, whatever has happened to the rest of it. Pure; no ROS.
+
+`survey` walks over a file once and tells where it is intact, where it is not and why. `messages`
+then reads the intact places. Neither trusts a length: each is held against what is left of the
+file and against a stated limit before anything is unpacked.
+
+An MCAP file (https://mcap.dev/spec) is a row of records: opcode (1 byte), length (8), content;
+little endian. Messages mostly lie in chunks, which are records that hold records, packed, with
+the CRC-32 of what they unpack to. Where the row breaks, the next record is sought byte by byte: a
+chunk states its length twice, in 64 bits each, so that chance does not make one; any other record
+must fit its length exactly, and a further one must follow. A chunk whose head is damaged is still
+known by its CRC. A chunk whose CRC does not fit is lost as a whole, because nothing tells which of
+its messages is false.
+"""
+
+import contextlib
+import io
+import mmap
+import re
+import struct
+import zlib
+from array import array
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import lz4.frame
+import zstandard
+
+MAGIC = b'\x89MCAP0\r\n'
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
+STATISTICS, DATA_END = 0x0B, 0x0F
+PRIVATE = 0x80  # opcodes from here on are free for applications
+RECORD = struct.Struct('<BQ')  # opcode, length
+MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
+# start and end time, size and CRC of what it unpacks to, length of the compression's name
+CHUNK_HEAD = struct.Struct('<QQQII')
+U32, U64 = struct.Struct('<I'), struct.Struct('<Q')
+# A record may begin here: a known opcode and a length below 1 TB.
+CANDIDATE = re.compile(rb'[\x01-\x0f](?=.{5}\x00{3})', re.DOTALL)
+LATEST_NS = 2**63 - 1
+STEP = 64 * 1024
+
+LARGEST_CHUNK = 64 * 1024 * 1024  # bytes that a chunk may unpack to
+LARGEST_RATIO = 1000  # a file may unpack to this many times its size and one largest chunk
+
+
+class Damage(Exception):
+    """Bytes that are not what they should be; the message says why."""
+
+
+class TooLarge(Damage):
+    """A limit is reached: nothing behind it is read."""
+
+
+class Schema(NamedTuple):
+    """A message type."""
+
+    name: str
+    encoding: str
+    definition: str
+    trusted: bool
+
+
+class Channel(NamedTuple):
+    """A topic."""
+
+    schema: int
+    topic: str
+    encoding: str
+    metadata: tuple[tuple[str, str], ...]
+
+
+class Message(NamedTuple):
+    """A message; `trusted` where a CRC vouches for it."""
+
+    channel: int
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+    trusted: bool
+
+
+class Chunk(NamedTuple):
+    """Where the content of a chunk lies in the file, and what it should unpack to."""
+
+    start: int
+    stop: int
+    compression: str
+    size: int
+    crc: int
+    whole: bool = True
+
+
+@dataclass
+class Gap:
+    """A damaged place.
+
+    Attributes:
+        start: Its first byte.
+        stop: The byte after its last.
+        reason: What is wrong.
+        from_ns: Log time of the newest message before it; 0 without one.
+        until_ns: Log time of the next message after it; 0 without one.
+        missing: Channel -> messages whose numbers are missing there.
+        lost: Whether bytes were lost that could have held messages.
+    """
+
+    start: int
+    stop: int
+    reason: str
+    from_ns: int = 0
+    until_ns: int = 0
+    missing: Counter[int] = field(default_factory=Counter)
+    lost: bool = True
+
+
+@dataclass
+class Survey:
+    """What a file holds.
+
+    Attributes:
+        path: The file.
+        size: Its bytes.
+        closed: Whether it ends as a complete file does.
+        gaps: Damaged places, in the order of the file.
+        schemas: Number -> message type.
+        channels: Number -> topic.
+        counts: Channel -> intact messages.
+        stated: Channel -> messages by the file's own statistics; empty without them.
+        numbered: Whether messages are numbered, so that those that are missing can be counted.
+        pieces: Offsets of intact chunks and of messages outside chunks.
+        odd: Offset -> chunk, of those whose head does not tell where they are.
+    """
+
+    path: Path
+    size: int
+    closed: bool = False
+    gaps: list[Gap] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    stated: dict[int, int] = field(default_factory=dict)
+    numbered: bool = False
+    pieces: array = field(default_factory=lambda: array('Q'))
+    odd: dict[int, Chunk] = field(default_factory=dict)
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong with the file."""
+        return self.closed and not self.gaps
+
+    @property
+    def bytes_per_message(self) -> float:
+        """Bytes of the file that a message takes on the average."""
+        count = sum(self.counts.values())
+        lost = sum(gap.stop - gap.start for gap in self.gaps)
+        return (self.size - lost) / count if count else float('inf')
+
+
+@contextlib.contextmanager
+def _mapped(path: Path) -> Iterator[bytes | mmap.mmap]:
+    with path.open('rb') as file:
+        if path.stat().st_size == 0:
+            yield b''
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
+            yield view
+
+
+def survey(path: Path) -> Survey:
+    """Walk over a file.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with _mapped(path) as view:
+        return _Surveyor(path, view).run()
+
+
+def messages(found: Survey) -> Iterator[Message]:
+    """The intact messages of a file, in the order in which they lie in it.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with _mapped(found.path) as view:
+        for offset in found.pieces:
+            chunk = found.odd.get(offset)
+            if chunk is None and view[offset] == MESSAGE:
+                start, stop = _frame(view, offset)
+                yield _message(view, start, stop, trusted=False)
+                continue
+            chunk = chunk or _chunk(view, offset)
+            content = _unpacked_part(view, chunk)
+            trusted = chunk.whole and chunk.crc != 0
+            try:
+                for opcode, start, stop in _records(content):
+                    if opcode == MESSAGE:
+                        yield _message(content, start, stop, trusted)
+            except Damage:
+                continue  # the survey has told of it
+
+
+class _Surveyor:
+    """The walk over one file."""
+
+    def __init__(self, path: Path, view: bytes | mmap.mmap):
+        self.view = view
+        self.found = Survey(path, len(view))
+        self.allowance = LARGEST_RATIO * len(view) + LARGEST_CHUNK
+        self.loose = array('Q')  # messages outside chunks
+        self.loose_heads: list[tuple[int, int, int]] = []
+        self.schemas: dict[int, Counter[Schema]] = {}
+        self.channels: dict[int, Counter[Channel]] = {}
+        self.last: dict[int, int] = {}  # channel -> number of its newest message
+        self.newest_ns = 0
+        self.steps = 0
+
+    def run(self) -> Survey:
+        view, found = self.view, self.found
+        at = len(MAGIC)
+        if view[:at] != MAGIC:
+            at = min(at, found.size)
+            self._gap(0, at, 'the file does not begin as an MCAP file', lost=False)
+        try:
+            while at < found.size and not found.closed:
+                at = self._step(at)
+        except TooLarge as error:
+            self._gap(at, found.size, str(error))
+        self._settle()
+        return found
+
+    def _settle(self) -> None:
+        found = self.found
+        if len(found.pieces) == 0:
+            found.pieces = self.loose
+            for head in self.loose_heads:
+                self._count(*head)
+        elif len(self.loose):
+            # Such a file has its messages in chunks: what lies outside is left of a broken one.
+            found.gaps = found.gaps or [Gap(self.loose[0], self.loose[-1], 'messages in no chunk')]
+        for number, schemas in self.schemas.items():
+            found.schemas[number] = max(schemas, key=lambda s: (s.trusted, schemas[s]))
+        for number, channels in self.channels.items():
+            found.channels[number] = channels.most_common(1)[0][0]
+        found.numbered = self.steps > 0
+
+    def _step(self, at: int) -> int:
+        """Take in the record at this place; return where the next one begins."""
+        try:
+            opcode = self.view[at]
+            start, stop = _frame(self.view, at)
+            if opcode == CHUNK:
+                self._take_chunk(at, _chunk(self.view, at))
+            else:
+                self._take(at, opcode, start, stop)
+            return stop
+        except TooLarge:
+            raise
+        except Damage as error:
+            return self._mend(at, str(error))
+
+    def _take(self, at: int, opcode: int, start: int, stop: int) -> None:
+        view, found = self.view, self.found
+        content = _parse(view, opcode, start, stop)
+        if opcode in (MESSAGE, SCHEMA, CHANNEL) or opcode >= PRIVATE:
+            # No CRC vouches for it: its length does if another record follows.
+            if not _may_begin(view, stop) and self._next(stop) < found.size:
+                raise Damage('no record follows where its length says')
+        if opcode == MESSAGE:
+            message = _message(view, start, stop, trusted=False)
+            self.loose.append(at)
+            self.loose_heads.append(message[:3])
+        elif opcode in (SCHEMA, CHANNEL):
+            self._announce(opcode, content, trusted=False)
+        elif opcode == STATISTICS:
+            found.stated = content
+        elif opcode == FOOTER:
+            if view[stop : stop + len(MAGIC)] != MAGIC:
+                raise Damage('the footer is not followed by the end of the file')
+            summary, _, crc = struct.unpack_from('<QQI', view, start)
+            if crc and (summary > start or zlib.crc32(view[summary : stop - 4]) != crc):
+                self._gap(min(summary, at), at, 'the CRC of the index does not fit', lost=False)
+            if stop + len(MAGIC) < found.size:
+                self._gap(stop + len(MAGIC), found.size, 'bytes after the end', lost=False)
+            found.closed = True
+
+    def _announce(self, opcode: int, content: tuple, trusted: bool) -> None:
+        number, announced = content
+        if opcode == SCHEMA:
+            announced = announced._replace(trusted=trusted)
+            self.schemas.setdefault(number, Counter())[announced] += 1
+        else:
+            # A CRC outweighs any number of repetitions without one.
+            self.channels.setdefault(number, Counter())[announced] += 1_000_000 if trusted else 1
+
+    def _take_chunk(self, at: int, chunk: Chunk) -> None:
+        """Take in a whole chunk; Damage, and nothing taken, unless it is intact."""
+        trusted = chunk.crc != 0
+        try:
+            content = self._unpack(chunk)
+            if trusted and zlib.crc32(content) != chunk.crc:
+                raise Damage('the CRC of a chunk does not fit')
+            self._take_content(content, trusted)
+        except TooLarge:
+            raise
+        except Damage:
+            if not trusted and chunk.size <= LARGEST_CHUNK:
+                self._take_part(at, chunk)
+            raise
+        self.found.pieces.append(at)
+
+    def _take_content(self, content: bytes, trusted: bool) -> None:
+        records = [(op, _parse(content, op, a, b)) for op, a, b in _records(content)]
+        for opcode, parsed in records:
+            if opcode == MESSAGE:
+                self._count(*parsed)
+            else:
+                self._announce(opcode, parsed, trusted)
+
+    def _take_part(self, at: int, chunk: Chunk) -> None:
+        """Take in what can be read of a chunk that no CRC vouches for, or that was cut off."""
+        chunk = chunk._replace(whole=False, stop=min(chunk.stop, self.found.size))
+        content = _unpacked_part(self.view, chunk)
+        self.allowance -= len(content)
+        count = 0
+        with contextlib.suppress(Damage):
+            for opcode, start, stop in _records(content):
+                parsed = _parse(content, opcode, start, stop)
+                if opcode == MESSAGE:
+                    self._count(*parsed)
+                    count += 1
+                else:
+                    self._announce(opcode, parsed, trusted=False)
+        if count:
+            self.found.pieces.append(at)
+            self.found.odd[at] = chunk
+
+    def _unpack(self, chunk: Chunk) -> bytes:
+        if chunk.size > LARGEST_CHUNK:
+            raise Damage(
+                f'a chunk unpacks to {chunk.size} bytes; at most {LARGEST_CHUNK} are allowed'
+            )
+        self.allowance -= max(chunk.size, chunk.stop - chunk.start)
+        if self.allowance < 0:
+            raise TooLarge(
+                f'the file unpacks to more than {LARGEST_RATIO} times its size and '
+                f'{LARGEST_CHUNK} bytes; nothing behind this place is read'
+            )
+        return _unpacked(self.view, chunk)
+
+    def _count(self, channel: int, sequence: int, log_ns: int) -> None:
+        found = self.found
+        found.counts[channel] += 1
+        last = self.last.get(channel, -1)
+        self.last[channel] = max(sequence, last)
+        if found.gaps:
+            gap = found.gaps[-1]
+            if not gap.until_ns:
+                for earlier in reversed(found.gaps):
+                    if earlier.until_ns:
+                        break
+                    earlier.until_ns = log_ns
+            # Nothing of this channel was seen since the gap, so it is there that some are missing.
+            if 0 < sequence - last - 1 <= gap.stop - gap.start:
+                gap.missing[channel] += sequence - last - 1
+        if sequence == last + 1 > 0:
+            self.steps += 1
+        self.newest_ns = max(self.newest_ns, log_ns)
+
+    def _gap(self, start: int, stop: int, reason: str, lost: bool = True) -> None:
+        self.found.gaps.append(Gap(start, stop, reason, self.newest_ns, lost=lost))
+
+    def _mend(self, at: int, reason: str) -> int:
+        """Go on behind a damaged place; return where."""
+        view, size = self.view, self.found.size
+        chunk = self._by_crc(at)
+        if chunk is not None:
+            self._gap(at, chunk.start, f'a chunk has a damaged head ({reason})', lost=False)
+            self._take_content(_unpacked(view, chunk), trusted=True)
+            self.found.pieces.append(at)
+            self.found.odd[at] = chunk
+            return chunk.stop
+        with contextlib.suppress(Damage):
+            # A damaged record between others that are in their places.
+            _, stop = _frame(view, at)
+            if view[at] == CHUNK:
+                _chunk(view, at)
+            if view[at] <= DATA_END and _may_begin(view, stop):
+                self._gap(at, stop, reason)
+                return stop
+        resumed = self._next(at + 1)
+        self._gap(at, resumed, reason if resumed < size else f'{reason}; nothing follows')
+        if resumed == size and view[at] == CHUNK and at not in self.found.odd:
+            with contextlib.suppress(Damage):
+                self._take_part(at, _chunk(view, at, cut_off=True))
+        return resumed
+
+    def _by_crc(self, at: int) -> Chunk | None:
+        """A chunk whose head is damaged, recognised by the CRC of its content."""
+        view, size = self.view, self.found.size
+        if at + RECORD.size + CHUNK_HEAD.size + U64.size > size:
+            return None
+        _, length = RECORD.unpack_from(view, at)
+        _, _, unpacked, crc, _ = CHUNK_HEAD.unpack_from(view, at + RECORD.size)
+        if crc == 0:
+            return None
+        for compression in ('', 'zstd', 'lz4'):
+            head = CHUNK_HEAD.size + len(compression) + U64.size
+            start = at + RECORD.size + head
+            if compression and not view[start : start + 4] in FRAMES[compression]:
+                continue
+            if start > size:
+                continue
+            (stated,) = U64.unpack_from(view, start - U64.size)
+            lengths = {stated, length - head} | ({unpacked} if not compression else set())
+            for taken in lengths:
+                if not 0 < taken <= size - start:
+                    continue
+                wanted = unpacked if compression else taken
+                chunk = Chunk(start, start + taken, compression, wanted, crc)
+                with contextlib.suppress(Damage):
+                    if zlib.crc32(self._unpack(chunk)) == crc and _may_begin(view, chunk.stop):
+                        return chunk
+        return None
+
+    def _next(self, at: int) -> int:
+        """The next place at which a record surely begins; the end of the file without one."""
+        view = self.view
+        for match in CANDIDATE.finditer(view, at):
+            begin = match.start()
+            try:
+                opcode = view[begin]
+                start, stop = _frame(view, begin)
+                if opcode == CHUNK:
+                    _chunk(view, begin)
+                    return begin
+                _parse(view, opcode, start, stop)
+                if stop == len(view) or opcode == FOOTER:
+                    if view[stop : stop + len(MAGIC)] == (MAGIC if opcode == FOOTER else b''):
+                        return begin
+                elif _may_begin(view, stop):
+                    return begin
+            except Damage:
+                continue
+        return len(view)
+
+
+FRAMES = {'zstd': (b'\x28\xb5\x2f\xfd',), 'lz4': (b'\x04\x22\x4d\x18',)}
+
+
+def _frame(view: bytes | mmap.mmap, at: int) -> tuple[int, int]:
+    """Where the content of the record at this place begins and ends."""
+    start = at + RECORD.size
+    if start > len(view):
+        raise Damage('a record is cut off by the end of the file')
+    _, length = RECORD.unpack_from(view, at)
+    if length > len(view) - start:
+        raise Damage('a record reaches beyond the end of the file')
+    return start, start + length
+
+
+def _may_begin(view: bytes | mmap.mmap, at: int) -> bool:
+    """Whether a record, or the end of the file, is here."""
+    if at == len(view):
+        return True
+    try:
+        opcode = view[at]
+        start, stop = _frame(view, at)
+        if opcode == CHUNK:
+            _chunk(view, at)
+        else:
+            _parse(view, opcode, start, stop)
+    except (Damage, IndexError):
+        return False
+    return True
+
+
+def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and stop of the content of each record in a chunk."""
+    at, size = 0, len(content)
+    while at < size:
+        if size - at < RECORD.size:
+            raise Damage('a record in a chunk is cut off')
+        opcode, length = RECORD.unpack_from(content, at)
+        start = at + RECORD.size
+        if opcode not in (SCHEMA, CHANNEL, MESSAGE):
+            raise Damage(f'a chunk holds a record of opcode {opcode}')
+        if length > size - start:
+            raise Damage('a record reaches beyond its chunk')
+        at = start + length
+        yield opcode, start, at
+
+
+def _message(content: bytes | mmap.mmap, start: int, stop: int, trusted: bool) -> Message:
+    head = MESSAGE_HEAD.unpack_from(content, start)
+    return Message(*head, content[start + MESSAGE_HEAD.size : stop], trusted)
+
+
+def _chunk(view: bytes | mmap.mmap, at: int, cut_off: bool = False) -> Chunk:
+    """The chunk at this place, by its head."""
+    start = at + RECORD.size
+    name = start + CHUNK_HEAD.size
+    if name + U64.size > len(view):
+        raise Damage('a chunk is cut off by the end of the file')
+    _, length = RECORD.unpack_from(view, at)
+    _, _, unpacked, crc, letters = CHUNK_HEAD.unpack_from(view, start)
+    if letters > 4 or name + letters + U64.size > len(view):
+        raise Damage('a chunk has a damaged head')
+    compression = view[name : name + letters].decode('ascii', 'replace')
+    if compression not in ('', 'zstd', 'lz4'):
+        raise Damage(f'a chunk has compression {compression!r}; zstd and lz4 are known')
+    (taken,) = U64.unpack_from(view, name + letters)
+    begin = name + letters + U64.size
+    if begin + taken != start + length:
+        raise Damage('a chunk has a damaged head: its two lengths differ')
+    if begin + taken > len(view) and not cut_off:
+        raise Damage('a chunk reaches beyond the end of the file')
+    return Chunk(begin, begin + taken, compression, unpacked, crc)
+
+
+def _unpacked(view: bytes | mmap.mmap, chunk: Chunk) -> bytes:
+    """The content of a chunk, of exactly the size that it states."""
+    packed = view[chunk.start : chunk.stop]
+    try:
+        if chunk.compression == '':
+            content = packed
+        elif chunk.compression == 'zstd':
+            stated = zstandard.frame_content_size(packed)
+            if stated not in (-1, chunk.size):
+                raise Damage(f'a chunk of {chunk.size} bytes unpacks to {stated}')
+            content = zstandard.ZstdDecompressor().decompress(
+                packed, max_output_size=chunk.size or 1
+            )
+        else:
+            unpacker = lz4.frame.LZ4FrameDecompressor()
+            content = unpacker.decompress(packed, max_length=chunk.size + 1)
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, ValueError) as error:
+        raise Damage(f'a chunk does not unpack ({error})') from None
+    if len(content) != chunk.size:
+        raise Damage(f'a chunk of {chunk.size} bytes unpacks to another size')
+    return content
+
+
+def is_bounded_zstd(packed: bytes) -> bool:
+    """Whether a zstd frame says to what it unpacks, within the limit."""
+    try:
+        return 0 <= zstandard.frame_content_size(packed) <= LARGEST_CHUNK
+    except zstandard.ZstdError:
+        return False
+
+
+def _unpacked_part(view: bytes | mmap.mmap, chunk: Chunk) -> bytes:
+    """The content of a chunk up to its first damage, of at most the size that it states."""
+    if chunk.whole:
+        return _unpacked(view, chunk)
+    packed = view[chunk.start : min(chunk.stop, len(view))]
+    size = min(chunk.size, LARGEST_CHUNK)
+    if chunk.compression == '':
+        return packed[:size]
+    parts, total = [], 0
+    try:
+        source: io.RawIOBase | zstandard.ZstdDecompressionReader
+        if chunk.compression == 'zstd':
+            source = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK).stream_reader(
+                packed
+            )
+        else:
+            source = lz4.frame.open(io.BytesIO(packed))
+        while total < size:
+            part = source.read(min(STEP, size - total))
+            if not part:
+                break
+            parts.append(part)
+            total += len(part)
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, ValueError):
+        pass  # what came before stays
+    return b''.join(parts)
+
+
+def _text(view: bytes | mmap.mmap, at: int, stop: int) -> tuple[str, int]:
+    """A text with its length before it, and where it ends."""
+    if stop - at < U32.size:
+        raise Damage('a text is cut off')
+    (length,) = U32.unpack_from(view, at)
+    begin = at + U32.size
+    if length > stop - begin:
+        raise Damage('a text reaches beyond its record')
+    try:
+        return view[begin : begin + length].decode(), begin + length
+    except UnicodeDecodeError:
+        raise Damage('a text is not UTF-8') from None
+
+
+def _parse(content: bytes | mmap.mmap, opcode: int, start: int, stop: int):
+    """What a record says, if it fits its length exactly; Damage otherwise.
+
+    Returns:
+        (channel, sequence, log time) of a message, (number, Schema), (number, Channel),
+        the counts of the statistics; None of any other.
+    """
+    if opcode == MESSAGE:
+        if stop - start < MESSAGE_HEAD.size:
+            raise Damage('a message is shorter than its head')
+        head = MESSAGE_HEAD.unpack_from(content, start)
+        if head[2] > LATEST_NS:
+            raise Damage(f'a message has the impossible time {head[2]} ns')
+        return head[:3]
+    if opcode >= PRIVATE:
+        return None
+    if opcode not in FIELDS:
+        raise Damage(f'a record has the unknown opcode {opcode}')
+    fields, at, values = FIELDS[opcode], start, []
+    for kind in fields:
+        if isinstance(kind, struct.Struct):
+            if stop - at < kind.size:
+                raise Damage('a record is shorter than its fields')
+            values += kind.unpack_from(content, at)
+            at += kind.size
+        elif kind == 'text':
+            text, at = _text(content, at, stop)
+            values.append(text)
+        else:  # a list of entries of that many bytes, or a map of texts, or bytes
+            size, width = _LIST[kind]
+            if stop - at < size.size:
+                raise Damage('a list is cut off')
+            (length,) = size.unpack_from(content, at)
+            at += size.size
+            if length > stop - at or length % width:
+                raise Damage('a list does not fit its record')
+            values.append((at, at + length))
+            at += length
+    if at != stop:
+        raise Damage('a record is longer than its fields')
+    if opcode == SCHEMA:
+        number, name, encoding, definition = values
+        return number, Schema(name, encoding, definition, False)
+    if opcode == CHANNEL:
+        number, schema, topic, encoding, (at, stop) = values
+        pairs = []
+        while at < stop:
+            key, at = _text(content, at, stop)
+            value, at = _text(content, at, stop)
+            pairs.append((key, value))
+        return number, Channel(schema, topic, encoding, tuple(pairs))
+    if opcode == STATISTICS:
+        at, stop = values[-1]
+        return dict(struct.iter_unpack('<HQ', content[at:stop]))
+    return None
+
+
+_LIST = {
+    'bytes': (U64, 1), 'map': (U32, 1), 'index': (U32, 16), 'offsets': (U32, 10),
+}  # fmt: skip
+FIELDS: dict[int, tuple] = {
+    HEADER: ('text', 'text'),
+    FOOTER: (struct.Struct('<QQI'),),
+    SCHEMA: (struct.Struct('<H'), 'text', 'text', 'text'),
+    CHANNEL: (struct.Struct('<HH'), 'text', 'text', 'map'),
+    0x07: (struct.Struct('<H'), 'index'),  # message index
+    0x08: (struct.Struct('<QQQQ'), 'offsets', U64, 'text', U64, U64),  # chunk index
+    0x09: (U64, U64, 'text', 'text', 'bytes', U32),  # attachment
+    0x0A: (struct.Struct('<QQQQQ'), 'text', 'text'),  # attachment index
+    STATISTICS: (struct.Struct('<QHIIIIQQ'), 'offsets'),
+    0x0C: ('text', 'map'),  # metadata
+    0x0D: (U64, U64, 'text'),  # metadata index
+    0x0E: (struct.Struct('<BQQ'),),  # summary offset
+    DATA_END: (U32,),
+}
