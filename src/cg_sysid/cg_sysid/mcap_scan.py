@@ -40,6 +40,13 @@ CHUNK_HEAD = struct.Struct('<QQQII')
 U32, U64 = struct.Struct('<I'), struct.Struct('<Q')
 # A record may begin here: a known opcode and a length below 1 TB.
 CANDIDATE = re.compile(rb'[\x01-\x0f](?=.{5}\x00{3})', re.DOTALL)
+# The rest of the head of a chunk whose beginning is gone: size, CRC, compression; then a length,
+# which for one that is not packed is the size once more.
+REST_OF_HEAD = re.compile(
+    rb'(?=(.{6}\x00\x00)(.{4})(?:\x00{4}\1|\x04\x00{3}zstd.{8}\x28\xb5\x2f\xfd'
+    rb'|\x03\x00{3}lz4.{8}\x04\x22\x4d\x18))',
+    re.DOTALL,
+)
 LATEST_NS = 2**63 - 1
 STEP = 64 * 1024
 
@@ -133,6 +140,7 @@ class Survey:
         stated: Channel -> messages by the file's own statistics; empty without them.
         numbered: Whether messages are numbered, so that those that are missing can be counted.
         pieces: Offsets of intact chunks and of messages outside chunks.
+        chunks: How many of them are chunks.
         odd: Offset -> chunk, of those whose head does not tell where they are.
     """
 
@@ -147,6 +155,7 @@ class Survey:
     numbered: bool = False
     pieces: array = field(default_factory=lambda: array('Q'))
     odd: dict[int, Chunk] = field(default_factory=dict)
+    chunks: int = 0
 
     @property
     def sound(self) -> bool:
@@ -178,7 +187,11 @@ def survey(path: Path) -> Survey:
         OSError: It cannot be read.
     """
     with _mapped(path) as view:
-        return _Surveyor(path, view).run()
+        found = _Surveyor(path, view, chunked=False).run()
+        if found.chunks and found.chunks < len(found.pieces):
+            # Such a file has its messages in chunks: what lies outside is left of a broken one.
+            found = _Surveyor(path, view, chunked=True).run()
+        return found
 
 
 def messages(found: Survey) -> Iterator[Message]:
@@ -206,19 +219,19 @@ def messages(found: Survey) -> Iterator[Message]:
 
 
 class _Surveyor:
-    """The walk over one file."""
+    """The walk over one file; in a `chunked` one nothing is taken in from outside chunks."""
 
-    def __init__(self, path: Path, view: bytes | mmap.mmap):
+    def __init__(self, path: Path, view: bytes | mmap.mmap, chunked: bool):
         self.view = view
         self.found = Survey(path, len(view))
         self.allowance = LARGEST_RATIO * len(view) + LARGEST_CHUNK
-        self.loose = array('Q')  # messages outside chunks
-        self.loose_heads: list[tuple[int, int, int]] = []
+        self.chunked = chunked
         self.schemas: dict[int, Counter[Schema]] = {}
         self.channels: dict[int, Counter[Channel]] = {}
         self.last: dict[int, int] = {}  # channel -> number of its newest message
         self.newest_ns = 0
         self.steps = 0
+        self.before = 0  # where the record before this one begins
 
     def run(self) -> Survey:
         view, found = self.view, self.found
@@ -236,18 +249,11 @@ class _Surveyor:
 
     def _settle(self) -> None:
         found = self.found
-        if len(found.pieces) == 0:
-            found.pieces = self.loose
-            for head in self.loose_heads:
-                self._count(*head)
-        elif len(self.loose):
-            # Such a file has its messages in chunks: what lies outside is left of a broken one.
-            found.gaps = found.gaps or [Gap(self.loose[0], self.loose[-1], 'messages in no chunk')]
         for number, schemas in self.schemas.items():
             found.schemas[number] = max(schemas, key=lambda s: (s.trusted, schemas[s]))
         for number, channels in self.channels.items():
             found.channels[number] = channels.most_common(1)[0][0]
-        found.numbered = self.steps > 0
+        found.numbered = 2 * self.steps > sum(found.counts.values())
 
     def _step(self, at: int) -> int:
         """Take in the record at this place; return where the next one begins."""
@@ -258,6 +264,7 @@ class _Surveyor:
                 self._take_chunk(at, _chunk(self.view, at))
             else:
                 self._take(at, opcode, start, stop)
+            self.before = at if opcode != CHUNK else stop
             return stop
         except TooLarge:
             raise
@@ -268,13 +275,14 @@ class _Surveyor:
         view, found = self.view, self.found
         content = _parse(view, opcode, start, stop)
         if opcode in (MESSAGE, SCHEMA, CHANNEL) or opcode >= PRIVATE:
-            # No CRC vouches for it: its length does if another record follows.
-            if not _may_begin(view, stop) and self._next(stop) < found.size:
+            # No CRC vouches for it: its length does if another record follows, or none is in it.
+            if not _may_begin(view, stop) and self._next(at + 1) < stop:
                 raise Damage('no record follows where its length says')
         if opcode == MESSAGE:
-            message = _message(view, start, stop, trusted=False)
-            self.loose.append(at)
-            self.loose_heads.append(message[:3])
+            if self.chunked:
+                raise Damage('a message is outside of the chunks')
+            self._count(*content)
+            found.pieces.append(at)
         elif opcode in (SCHEMA, CHANNEL):
             self._announce(opcode, content, trusted=False)
         elif opcode == STATISTICS:
@@ -312,7 +320,13 @@ class _Surveyor:
             if not trusted and chunk.size <= LARGEST_CHUNK:
                 self._take_part(at, chunk)
             raise
+        self._keep(at)
+
+    def _keep(self, at: int, odd: Chunk | None = None) -> None:
         self.found.pieces.append(at)
+        self.found.chunks += 1
+        if odd is not None:
+            self.found.odd[at] = odd
 
     def _take_content(self, content: bytes, trusted: bool) -> None:
         records = [(op, _parse(content, op, a, b)) for op, a, b in _records(content)]
@@ -337,8 +351,7 @@ class _Surveyor:
                 else:
                     self._announce(opcode, parsed, trusted=False)
         if count:
-            self.found.pieces.append(at)
-            self.found.odd[at] = chunk
+            self._keep(at, chunk)
 
     def _unpack(self, chunk: Chunk) -> bytes:
         if chunk.size > LARGEST_CHUNK:
@@ -380,11 +393,7 @@ class _Surveyor:
         view, size = self.view, self.found.size
         chunk = self._by_crc(at)
         if chunk is not None:
-            self._gap(at, chunk.start, f'a chunk has a damaged head ({reason})', lost=False)
-            self._take_content(_unpacked(view, chunk), trusted=True)
-            self.found.pieces.append(at)
-            self.found.odd[at] = chunk
-            return chunk.stop
+            return self._take_headless(at, chunk, reason)
         with contextlib.suppress(Damage):
             # A damaged record between others that are in their places.
             _, stop = _frame(view, at)
@@ -394,11 +403,54 @@ class _Surveyor:
                 self._gap(at, stop, reason)
                 return stop
         resumed = self._next(at + 1)
+        chunk = self._headless(at, resumed)
+        if chunk is not None:
+            return self._take_headless(at, chunk, reason)
         self._gap(at, resumed, reason if resumed < size else f'{reason}; nothing follows')
         if resumed == size and view[at] == CHUNK and at not in self.found.odd:
             with contextlib.suppress(Damage):
                 self._take_part(at, _chunk(view, at, cut_off=True))
         return resumed
+
+    def _take_headless(self, at: int, chunk: Chunk, reason: str) -> int:
+        """Take in a chunk of which only the CRC vouches; return where it ends."""
+        self._gap(at, max(at, chunk.start), f'a chunk has a damaged head ({reason})')
+        self._take_content(_unpacked(self.view, chunk), trusted=True)
+        self._keep(at, chunk)
+        self.before = chunk.stop
+        return chunk.stop
+
+    def _headless(self, at: int, stop: int) -> Chunk | None:
+        """The first chunk that ends behind a place, of which only the beginning is damaged."""
+        view = self.view
+        # Where bytes are gone, the record before may have taken in the beginning of a chunk.
+        for match in REST_OF_HEAD.finditer(view, min(at, self.before or at), stop):
+            begin = match.start()
+            unpacked, crc, letters = struct.unpack_from('<QII', view, begin)
+            place = begin + 16 + letters
+            (taken,) = U64.unpack_from(view, place)
+            start = place + U64.size
+            if crc == 0 or not 0 < taken <= len(view) - start:
+                continue
+            compression = view[begin + 16 : place].decode('ascii', 'replace')
+            chunk = Chunk(start, start + taken, compression, unpacked, crc)
+            if chunk.stop > at and self._fits(chunk):
+                return chunk
+        return None
+
+    def _fits(self, chunk: Chunk) -> bool:
+        """Whether a chunk unpacks to what its CRC says, and that to records."""
+        try:
+            content = self._unpack(chunk)
+            if zlib.crc32(content) != chunk.crc:
+                return False
+            for opcode, start, stop in _records(content):
+                _parse(content, opcode, start, stop)
+        except TooLarge:
+            raise
+        except Damage:
+            return False
+        return True
 
     def _by_crc(self, at: int) -> Chunk | None:
         """A chunk whose head is damaged, recognised by the CRC of its content."""
@@ -423,9 +475,8 @@ class _Surveyor:
                     continue
                 wanted = unpacked if compression else taken
                 chunk = Chunk(start, start + taken, compression, wanted, crc)
-                with contextlib.suppress(Damage):
-                    if zlib.crc32(self._unpack(chunk)) == crc and _may_begin(view, chunk.stop):
-                        return chunk
+                if self._fits(chunk):
+                    return chunk
         return None
 
     def _next(self, at: int) -> int:
@@ -439,6 +490,8 @@ class _Surveyor:
                 if opcode == CHUNK:
                     _chunk(view, begin)
                     return begin
+                if opcode == MESSAGE and self.chunked:
+                    continue
                 _parse(view, opcode, start, stop)
                 if stop == len(view) or opcode == FOOTER:
                     if view[stop : stop + len(MAGIC)] == (MAGIC if opcode == FOOTER else b''):

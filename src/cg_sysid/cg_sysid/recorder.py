@@ -150,6 +150,11 @@ class Recording:
         self.messages = 0
         self.begun = False
         self._types = topics
+        # Not while samples wait: making a definition takes tens of ms.
+        self._definitions = {
+            msgtype: TYPESTORE.generate_msgdef(msgtype, ros_version=2)[0]
+            for msgtype in sorted(set(topics.values()))
+        }
         self._by_stamp = by_stamp
         self._expected = expected
         self._journal = Journal(path / JOURNAL_NAME)
@@ -165,8 +170,7 @@ class Recording:
     def announce(self, topic: str, qos_profiles: list[dict[str, Any]]) -> None:
         """Open a channel for the topic, and note the QoS that its publishers offer."""
         msgtype = self._types[topic]
-        definition, _ = TYPESTORE.generate_msgdef(msgtype, ros_version=2)
-        channel = self._journal.add_channel(topic, msgtype, definition)
+        channel = self._journal.add_channel(topic, msgtype, self._definitions[msgtype])
         self._topics[topic] = RecordedTopic(channel, is_stamped(msgtype))
         self._status['qos'][topic] = qos_profiles
         self._journal.set_status(self._status, 0)

@@ -16,7 +16,7 @@ import os
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -262,8 +262,7 @@ def _sources(path: Path) -> list[Path]:
 
 
 def _make(staged: Path, sources: list[Path], target: Path) -> Recovered:
-    contents = Contents([survey(source) for source in sources])
-    _learn_status(contents)
+    contents = contents_of(sources)
     writer = BagWriter(staged)
     with writer:
         begun, count = _write(writer, contents)
@@ -272,6 +271,17 @@ def _make(staged: Path, sources: list[Path], target: Path) -> Recovered:
         for key, value in _custom_data(result).items():
             writer.set_custom_data(key, value)
     return result
+
+
+def contents_of(sources: Sequence[Path]) -> Contents:
+    """Look through the files of a recording.
+
+    Raises:
+        OSError: One cannot be read.
+    """
+    contents = Contents([survey(source) for source in sources])
+    _learn_status(contents)
+    return contents
 
 
 def _learn_status(contents: Contents) -> None:
@@ -285,7 +295,7 @@ def _learn_status(contents: Contents) -> None:
                     contents.status = dict(json.loads(message.data))
 
 
-def _entries(contents: Contents) -> Iterator[Entry]:
+def entries(contents: Contents) -> Iterator[Entry]:
     """Every intact message of known type from where the bag begins on."""
     begin_ns = contents.status.get('begin_ns') or 0
     for found in contents.surveys:
@@ -403,11 +413,11 @@ def _qos(profiles: Any) -> list[Qos]:
         return []
 
 
-def _sorted(entries: Iterator[Entry]) -> Iterator[Entry]:
+def _sorted(unsorted: Iterator[Entry]) -> Iterator[Entry]:
     """By log time, then topic, then order of arrival; the same for every order of arrival."""
     heap: list[Entry] = []
     newest = 0
-    for entry in entries:
+    for entry in unsorted:
         heapq.heappush(heap, entry)
         newest = max(newest, entry.log_ns)
         while heap[0].log_ns < newest - REORDER_NS:
@@ -420,7 +430,13 @@ def _write(writer: BagWriter, contents: Contents) -> tuple[int, int]:
     """Write every message; return the first log time and the count."""
     connections: dict[str, Connection] = {}
     count, begun = 0, 0
-    for entry in _sorted(_entries(contents)):
+    damaged = any(found.gaps for found in contents.surveys)
+    newest: dict[str, Entry] = {}
+    for entry in _sorted(entries(contents)):
+        before = newest.get(entry.topic)
+        if damaged and before and (before.log_ns, before.data) == (entry.log_ns, entry.data):
+            continue  # a part of the file that is there twice
+        newest[entry.topic] = entry
         if entry.topic not in connections:
             connections[entry.topic] = _connection(writer, contents.topics[entry.topic])
         writer.write(connections[entry.topic], entry.log_ns, entry.data)
@@ -465,7 +481,7 @@ def _loss(found: Survey, gap: Gap) -> Loss:
     named = {
         _name_of(found, channel): count
         for channel, count in gap.missing.items()
-        if not _is_status(found, channel)
+        if found.numbered and not _is_status(found, channel)
     }
     if found.numbered and gap.until_ns:
         estimate = sum(named.values())

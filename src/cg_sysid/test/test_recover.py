@@ -1,9 +1,11 @@
-"""A journal cut off anywhere becomes an ordinary bag of everything before the cut."""
+"""A journal, whatever became of it, gives an ordinary bag of everything that is intact."""
 
+import json
 import shutil
 
 import numpy as np
 import pytest
+import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.typesys import Stores, get_typestore
@@ -47,7 +49,7 @@ def note(text):
 
 
 def journal(path, samples=200, order=1):
-    """A recording that was never closed: 2 topics at 500 Hz, one chunk for every 10 ms."""
+    """A recording that was never closed: 2 topics at 500 Hz."""
     recording = Recording(path, TOPICS, by_stamp=True)
     for topic in TOPICS:
         recording.announce(topic, [QOS])
@@ -94,21 +96,20 @@ def test_ordinary_readers_refuse_what_recover_reads(tmp_path):
     assert not needs_recovery(tmp_path / 'bag')
 
 
-def test_a_killed_recording_lacks_no_more_than_its_open_chunk(tmp_path):
+def test_a_killed_recording_lacks_nothing_that_was_written(tmp_path):
     journal(tmp_path / 'bag', samples=201)
-    recover(tmp_path / 'bag')
+    assert recover(tmp_path / 'bag').messages == 403
     stamps = [t for topic, t, _ in content(tmp_path / 'bag') if topic == '/hip_encoder']
-    assert stamps == [10**9 + 2 * MS * k for k in range(len(stamps))]
-    assert 10**9 + 2 * MS * 200 - stamps[-1] <= 10 * MS
+    assert stamps == [10**9 + 2 * MS * k for k in range(201)]
 
 
 def test_cut_anywhere_everything_before_the_cut_is_there(tmp_path):
-    journal(tmp_path / 'whole', samples=60)
+    journal(tmp_path / 'whole', samples=20)
     data = (tmp_path / 'whole' / JOURNAL_NAME).read_bytes()
     recover(tmp_path / 'whole')
     whole = content(tmp_path / 'whole')
     counts = []
-    for index, length in enumerate(range(200, len(data), 97)):
+    for index, length in enumerate(range(200, len(data), 211)):
         bag = tmp_path / f'cut{index}'
         bag.mkdir()
         (bag / JOURNAL_NAME).write_bytes(data[:length])
@@ -126,15 +127,78 @@ def test_cut_anywhere_everything_before_the_cut_is_there(tmp_path):
     assert counts[-1] > 0.8 * len(whole)
 
 
-def test_a_damaged_chunk_ends_the_reading_and_is_reported(tmp_path):
+def test_a_flipped_bit_costs_its_message_and_is_told(tmp_path):
     journal(tmp_path / 'bag', samples=100)
     file = tmp_path / 'bag' / JOURNAL_NAME
     data = bytearray(file.read_bytes())
-    data[len(data) * 3 // 4] ^= 0xFF
+    data[len(data) * 3 // 4] ^= 0x10
     file.write_bytes(data)
     result = recover(tmp_path / 'bag')
-    assert JOURNAL_NAME in result.damage
-    assert 0 < result.messages < 201
+    (loss,) = result.losses
+    assert (result.messages, loss.estimate, sum(loss.messages.values())) == (200, 1, 1)
+    assert loss.start <= len(data) * 3 // 4 < loss.stop
+    assert 0 < loss.until_ns - loss.from_ns <= 4 * MS
+    assert 'the CRC of a chunk does not fit; about 1 messages lost (1 of /' in result.damage[0]
+    assert (tmp_path / 'bag' / f'{JOURNAL_NAME}.damaged').read_bytes() == data
+    with AnyReader([tmp_path / 'bag']) as reader:
+        info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+        told = info['rosbag2_bagfile_information']['custom_data']['damage']
+        assert json.loads(told) == list(result.damage)
+        assert reader.message_count == 200
+
+
+def test_messages_are_told_apart_from_those_that_were_never_expected(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
+    for topic in TOPICS:
+        recording.announce(topic, [])
+    recording.write('/experiment', note('mechanism: compass_gait'), 10**9, 0.0)
+    for k in range(50):
+        log = 2 * 10**9 + 2 * MS * k
+        recording.write('/applied_torque', joint_state(log, k), log, 0.0)
+        if k >= 20:
+            recording.write('/hip_encoder', joint_state(log, k), log + 1, 0.0)
+    assert recording.silent == ()
+    begin_ns = recording.begin()
+    result = recording.close()
+    assert begin_ns == 2 * 10**9 + 40 * MS + 1
+    assert result.left_out == 21
+    # The note is latched: it holds from the beginning on, though it came before.
+    assert content(tmp_path / 'bag')[0][:2] == ('/experiment', begin_ns)
+    assert {t for _, t, _ in content(tmp_path / 'bag')} >= {begin_ns, begin_ns - 1 + 2 * MS}
+    assert not result.began_late
+
+
+def test_nothing_is_left_out_if_all_began_with_one_stamp(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
+    for topic in TOPICS:
+        recording.announce(topic, [])
+    for k in range(5):
+        for delay, topic in ((0, '/applied_torque'), (30 * MS, '/hip_encoder')):
+            recording.write(topic, joint_state(10**9 + k, k), 10**9 + 2 * MS * k + delay, 0.0)
+    assert recording.begin() == 0
+    result = recording.close()
+    assert (result.messages, result.left_out) == (10, 0)
+    assert result.began_late == {'/hip_encoder': pytest.approx(0.03)}
+
+
+def test_a_topic_that_never_began_is_told(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
+    recording.announce('/applied_torque', [QOS])
+    recording.write('/applied_torque', joint_state(10**9, 1), 2 * 10**9, 0.0)
+    assert recording.silent == ('/hip_encoder',)
+    assert recording.begin() == 0
+    result = recording.close()
+    assert result.began_late == {'/hip_encoder': None}
+    assert result.remarks == ('/hip_encoder never began',)
+
+
+def test_messages_that_were_received_late_are_told(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, by_stamp=False)
+    recording.announce('/applied_torque', [QOS])
+    for k, delay in enumerate((MS, 2 * MS, 61 * MS, MS)):
+        stamp = 10**9 + 2 * MS * k
+        recording.write('/applied_torque', joint_state(stamp, k), stamp + delay, 0.0)
+    assert recording.close().received_late == {'/applied_torque': pytest.approx(0.06)}
 
 
 def test_recovery_that_is_cut_off_can_be_repeated(tmp_path):
