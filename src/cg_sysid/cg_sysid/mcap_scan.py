@@ -31,7 +31,7 @@ import zstandard
 
 MAGIC = b'\x89MCAP0\r\n'
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-STATISTICS, DATA_END = 0x0B, 0x0F
+STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
 PRIVATE = 0x80  # opcodes from here on are free for applications
 RECORD = struct.Struct('<BQ')  # opcode, length
 MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
@@ -47,6 +47,8 @@ REST_OF_HEAD = re.compile(
     rb'|\x03\x00{3}lz4.{8}\x04\x22\x4d\x18))',
     re.DOTALL,
 )
+TYPE_NAME = re.compile(r'\w+/(msg/)?\w+', re.ASCII)
+TOPIC_NAME = re.compile(r'/[\w/~]+', re.ASCII)
 LATEST_NS = 2**63 - 1
 STEP = 64 * 1024
 
@@ -250,9 +252,13 @@ class _Surveyor:
     def _settle(self) -> None:
         found = self.found
         for number, schemas in self.schemas.items():
-            found.schemas[number] = max(schemas, key=lambda s: (s.trusted, schemas[s]))
+            found.schemas[number] = max(
+                schemas, key=lambda s: (s.trusted, schemas[s], bool(TYPE_NAME.fullmatch(s.name)))
+            )
         for number, channels in self.channels.items():
-            found.channels[number] = channels.most_common(1)[0][0]
+            found.channels[number] = max(
+                channels, key=lambda c: (channels[c], bool(TOPIC_NAME.fullmatch(c.topic)))
+            )
         found.numbered = 2 * self.steps > sum(found.counts.values())
 
     def _step(self, at: int) -> int:
@@ -649,6 +655,16 @@ def _text(view: bytes | mmap.mmap, at: int, stop: int) -> tuple[str, int]:
         raise Damage('a text is not UTF-8') from None
 
 
+def _pairs(content: bytes | mmap.mmap, at: int, stop: int) -> tuple[tuple[str, str], ...]:
+    """A map of texts."""
+    pairs = []
+    while at < stop:
+        key, at = _text(content, at, stop)
+        value, at = _text(content, at, stop)
+        pairs.append((key, value))
+    return tuple(pairs)
+
+
 def _parse(content: bytes | mmap.mmap, opcode: int, start: int, stop: int):
     """What a record says, if it fits its length exactly; Damage otherwise.
 
@@ -692,14 +708,11 @@ def _parse(content: bytes | mmap.mmap, opcode: int, start: int, stop: int):
     if opcode == SCHEMA:
         number, name, encoding, definition = values
         return number, Schema(name, encoding, definition, False)
+    if opcode == METADATA:
+        _pairs(content, *values[-1])
     if opcode == CHANNEL:
-        number, schema, topic, encoding, (at, stop) = values
-        pairs = []
-        while at < stop:
-            key, at = _text(content, at, stop)
-            value, at = _text(content, at, stop)
-            pairs.append((key, value))
-        return number, Channel(schema, topic, encoding, tuple(pairs))
+        number, schema, topic, encoding, place = values
+        return number, Channel(schema, topic, encoding, _pairs(content, *place))
     if opcode == STATISTICS:
         at, stop = values[-1]
         return dict(struct.iter_unpack('<HQ', content[at:stop]))
@@ -719,7 +732,7 @@ FIELDS: dict[int, tuple] = {
     0x09: (U64, U64, 'text', 'text', 'bytes', U32),  # attachment
     0x0A: (struct.Struct('<QQQQQ'), 'text', 'text'),  # attachment index
     STATISTICS: (struct.Struct('<QHIIIIQQ'), 'offsets'),
-    0x0C: ('text', 'map'),  # metadata
+    METADATA: ('text', 'map'),
     0x0D: (U64, U64, 'text'),  # metadata index
     0x0E: (struct.Struct('<BQQ'),),  # summary offset
     DATA_END: (U32,),
