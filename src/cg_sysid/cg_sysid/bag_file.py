@@ -6,7 +6,6 @@ little (mcap_scan.py). The numbers of the messages tell how many are missing.
 """
 
 from pathlib import Path
-from typing import ClassVar
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -67,7 +66,7 @@ class CheckedMcap:
 class BagWriter(Writer):
     """Writes a rosbag2 directory."""
 
-    STORAGE_PLUGINS: ClassVar = {StoragePlugin.MCAP: CheckedMcap}
+    STORAGE_PLUGINS = {StoragePlugin.MCAP: CheckedMcap}  # noqa: RUF012
 
     def __init__(self, path: Path):
         """Prepare to write the directory `path`, which must not exist yet."""

@@ -10,15 +10,8 @@ from pathlib import Path
 import zstandard
 
 from cg_sysid.errors import RecordingError
-from cg_sysid.mcap_scan import (
-    LARGEST_CHUNK,
-    LARGEST_RATIO,
-    MAGIC,
-    Survey,
-    is_bounded_zstd,
-    messages,
-    survey,
-)
+from cg_sysid.mcap_records import LARGEST_CHUNK, MAGIC, is_bounded_zstd
+from cg_sysid.mcap_scan import LARGEST_RATIO, Survey, messages, survey
 from cg_sysid.recover import METADATA, needs_recovery
 
 LOGS = ('.csv', '.mat', '.json')  # what an import is needed for

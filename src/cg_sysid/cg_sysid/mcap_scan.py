@@ -14,7 +14,6 @@ its messages is false.
 """
 
 import contextlib
-import io
 import mmap
 import re
 import struct
@@ -24,20 +23,37 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
-import lz4.frame
-import zstandard
+from cg_sysid.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    FRAMES,
+    LARGEST_CHUNK,
+    MAGIC,
+    MESSAGE,
+    PRIVATE,
+    RECORD,
+    SCHEMA,
+    STATISTICS,
+    U64,
+    Channel,
+    Chunk,
+    Damage,
+    Message,
+    Schema,
+    chunk_at,
+    frame,
+    may_begin,
+    message_at,
+    parse,
+    records_of,
+    unpacked,
+    unpacked_part,
+)
 
-MAGIC = b'\x89MCAP0\r\n'
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
-PRIVATE = 0x80  # opcodes from here on are free for applications
-RECORD = struct.Struct('<BQ')  # opcode, length
-MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
-# start and end time, size and CRC of what it unpacks to, length of the compression's name
-CHUNK_HEAD = struct.Struct('<QQQII')
-U32, U64 = struct.Struct('<I'), struct.Struct('<Q')
 # A record may begin here: a known opcode and a length below 1 TB.
 CANDIDATE = re.compile(rb'[\x01-\x0f](?=.{5}\x00{3})', re.DOTALL)
 # The rest of the head of a chunk whose beginning is gone: size, CRC, compression; then a length,
@@ -49,59 +65,11 @@ REST_OF_HEAD = re.compile(
 )
 TYPE_NAME = re.compile(r'\w+/(msg/)?\w+', re.ASCII)
 TOPIC_NAME = re.compile(r'/[\w/~]+', re.ASCII)
-LATEST_NS = 2**63 - 1
-STEP = 64 * 1024
-
-LARGEST_CHUNK = 64 * 1024 * 1024  # bytes that a chunk may unpack to
 LARGEST_RATIO = 1000  # a file may unpack to this many times its size and one largest chunk
-
-
-class Damage(Exception):
-    """Bytes that are not what they should be; the message says why."""
 
 
 class TooLarge(Damage):
     """A limit is reached: nothing behind it is read."""
-
-
-class Schema(NamedTuple):
-    """A message type."""
-
-    name: str
-    encoding: str
-    definition: str
-    trusted: bool
-
-
-class Channel(NamedTuple):
-    """A topic."""
-
-    schema: int
-    topic: str
-    encoding: str
-    metadata: tuple[tuple[str, str], ...]
-
-
-class Message(NamedTuple):
-    """A message; `trusted` where a CRC vouches for it."""
-
-    channel: int
-    sequence: int
-    log_ns: int
-    publish_ns: int
-    data: bytes
-    trusted: bool
-
-
-class Chunk(NamedTuple):
-    """Where the content of a chunk lies in the file, and what it should unpack to."""
-
-    start: int
-    stop: int
-    compression: str
-    size: int
-    crc: int
-    whole: bool = True
 
 
 @dataclass
@@ -206,16 +174,16 @@ def messages(found: Survey) -> Iterator[Message]:
         for offset in found.pieces:
             chunk = found.odd.get(offset)
             if chunk is None and view[offset] == MESSAGE:
-                start, stop = _frame(view, offset)
-                yield _message(view, start, stop, trusted=False)
+                start, stop = frame(view, offset)
+                yield message_at(view, start, stop, trusted=False)
                 continue
-            chunk = chunk or _chunk(view, offset)
-            content = _unpacked_part(view, chunk)
+            chunk = chunk or chunk_at(view, offset)
+            content = unpacked_part(view, chunk)
             trusted = chunk.whole and chunk.crc != 0
             try:
-                for opcode, start, stop in _records(content):
+                for opcode, start, stop in records_of(content):
                     if opcode == MESSAGE:
-                        yield _message(content, start, stop, trusted)
+                        yield message_at(content, start, stop, trusted)
             except Damage:
                 continue  # the survey has told of it
 
@@ -265,9 +233,9 @@ class _Surveyor:
         """Take in the record at this place; return where the next one begins."""
         try:
             opcode = self.view[at]
-            start, stop = _frame(self.view, at)
+            start, stop = frame(self.view, at)
             if opcode == CHUNK:
-                self._take_chunk(at, _chunk(self.view, at))
+                self._take_chunk(at, chunk_at(self.view, at))
             else:
                 self._take(at, opcode, start, stop)
             self.before = at if opcode != CHUNK else stop
@@ -279,10 +247,10 @@ class _Surveyor:
 
     def _take(self, at: int, opcode: int, start: int, stop: int) -> None:
         view, found = self.view, self.found
-        content = _parse(view, opcode, start, stop)
+        content = parse(view, opcode, start, stop)
         if opcode in (MESSAGE, SCHEMA, CHANNEL) or opcode >= PRIVATE:
             # No CRC vouches for it: its length does if another record follows, or none is in it.
-            if not _may_begin(view, stop) and self._next(at + 1) < stop:
+            if not may_begin(view, stop) and self._next(at + 1, stop) < stop:
                 raise Damage('no record follows where its length says')
         if opcode == MESSAGE:
             if self.chunked:
@@ -335,7 +303,7 @@ class _Surveyor:
             self.found.odd[at] = odd
 
     def _take_content(self, content: bytes, trusted: bool) -> None:
-        records = [(op, _parse(content, op, a, b)) for op, a, b in _records(content)]
+        records = [(op, parse(content, op, a, b)) for op, a, b in records_of(content)]
         for opcode, parsed in records:
             if opcode == MESSAGE:
                 self._count(*parsed)
@@ -345,12 +313,12 @@ class _Surveyor:
     def _take_part(self, at: int, chunk: Chunk) -> None:
         """Take in what can be read of a chunk that no CRC vouches for, or that was cut off."""
         chunk = chunk._replace(whole=False, stop=min(chunk.stop, self.found.size))
-        content = _unpacked_part(self.view, chunk)
+        content = unpacked_part(self.view, chunk)
         self.allowance -= len(content)
         count = 0
         with contextlib.suppress(Damage):
-            for opcode, start, stop in _records(content):
-                parsed = _parse(content, opcode, start, stop)
+            for opcode, start, stop in records_of(content):
+                parsed = parse(content, opcode, start, stop)
                 if opcode == MESSAGE:
                     self._count(*parsed)
                     count += 1
@@ -370,7 +338,7 @@ class _Surveyor:
                 f'the file unpacks to more than {LARGEST_RATIO} times its size and '
                 f'{LARGEST_CHUNK} bytes; nothing behind this place is read'
             )
-        return _unpacked(self.view, chunk)
+        return unpacked(self.view, chunk)
 
     def _count(self, channel: int, sequence: int, log_ns: int) -> None:
         found = self.found
@@ -402,10 +370,10 @@ class _Surveyor:
             return self._take_headless(at, chunk, reason)
         with contextlib.suppress(Damage):
             # A damaged record between others that are in their places.
-            _, stop = _frame(view, at)
+            _, stop = frame(view, at)
             if view[at] == CHUNK:
-                _chunk(view, at)
-            if view[at] <= DATA_END and _may_begin(view, stop):
+                chunk_at(view, at)
+            if view[at] <= DATA_END and may_begin(view, stop):
                 self._gap(at, stop, reason)
                 return stop
         resumed = self._next(at + 1)
@@ -415,13 +383,13 @@ class _Surveyor:
         self._gap(at, resumed, reason if resumed < size else f'{reason}; nothing follows')
         if resumed == size and view[at] == CHUNK and at not in self.found.odd:
             with contextlib.suppress(Damage):
-                self._take_part(at, _chunk(view, at, cut_off=True))
+                self._take_part(at, chunk_at(view, at, cut_off=True))
         return resumed
 
     def _take_headless(self, at: int, chunk: Chunk, reason: str) -> int:
         """Take in a chunk of which only the CRC vouches; return where it ends."""
         self._gap(at, max(at, chunk.start), f'a chunk has a damaged head ({reason})')
-        self._take_content(_unpacked(self.view, chunk), trusted=True)
+        self._take_content(unpacked(self.view, chunk), trusted=True)
         self._keep(at, chunk)
         self.before = chunk.stop
         return chunk.stop
@@ -432,14 +400,14 @@ class _Surveyor:
         # Where bytes are gone, the record before may have taken in the beginning of a chunk.
         for match in REST_OF_HEAD.finditer(view, min(at, self.before or at), stop):
             begin = match.start()
-            unpacked, crc, letters = struct.unpack_from('<QII', view, begin)
+            size, crc, letters = struct.unpack_from('<QII', view, begin)
             place = begin + 16 + letters
             (taken,) = U64.unpack_from(view, place)
             start = place + U64.size
             if crc == 0 or not 0 < taken <= len(view) - start:
                 continue
             compression = view[begin + 16 : place].decode('ascii', 'replace')
-            chunk = Chunk(start, start + taken, compression, unpacked, crc)
+            chunk = Chunk(start, start + taken, compression, size, crc)
             if chunk.stop > at and self._fits(chunk):
                 return chunk
         return None
@@ -450,8 +418,8 @@ class _Surveyor:
             content = self._unpack(chunk)
             if zlib.crc32(content) != chunk.crc:
                 return False
-            for opcode, start, stop in _records(content):
-                _parse(content, opcode, start, stop)
+            for opcode, start, stop in records_of(content):
+                parse(content, opcode, start, stop)
         except TooLarge:
             raise
         except Damage:
@@ -464,276 +432,47 @@ class _Surveyor:
         if at + RECORD.size + CHUNK_HEAD.size + U64.size > size:
             return None
         _, length = RECORD.unpack_from(view, at)
-        _, _, unpacked, crc, _ = CHUNK_HEAD.unpack_from(view, at + RECORD.size)
+        _, _, size_of_content, crc, _ = CHUNK_HEAD.unpack_from(view, at + RECORD.size)
         if crc == 0:
             return None
         for compression in ('', 'zstd', 'lz4'):
             head = CHUNK_HEAD.size + len(compression) + U64.size
             start = at + RECORD.size + head
-            if compression and not view[start : start + 4] in FRAMES[compression]:
+            if compression and view[start : start + 4] != FRAMES[compression]:
                 continue
             if start > size:
                 continue
             (stated,) = U64.unpack_from(view, start - U64.size)
-            lengths = {stated, length - head} | ({unpacked} if not compression else set())
+            lengths = {stated, length - head} | ({size_of_content} if not compression else set())
             for taken in lengths:
                 if not 0 < taken <= size - start:
                     continue
-                wanted = unpacked if compression else taken
+                wanted = size_of_content if compression else taken
                 chunk = Chunk(start, start + taken, compression, wanted, crc)
                 if self._fits(chunk):
                     return chunk
         return None
 
-    def _next(self, at: int) -> int:
-        """The next place at which a record surely begins; the end of the file without one."""
+    def _next(self, at: int, end: int | None = None) -> int:
+        """The next place, before the end, at which a record surely begins; the end without one."""
         view = self.view
-        for match in CANDIDATE.finditer(view, at):
+        end = len(view) if end is None else end
+        for match in CANDIDATE.finditer(view, at, end):
             begin = match.start()
             try:
                 opcode = view[begin]
-                start, stop = _frame(view, begin)
+                start, stop = frame(view, begin)
                 if opcode == CHUNK:
-                    _chunk(view, begin)
+                    chunk_at(view, begin)
                     return begin
                 if opcode == MESSAGE and self.chunked:
                     continue
-                _parse(view, opcode, start, stop)
+                parse(view, opcode, start, stop)
                 if stop == len(view) or opcode == FOOTER:
                     if view[stop : stop + len(MAGIC)] == (MAGIC if opcode == FOOTER else b''):
                         return begin
-                elif _may_begin(view, stop):
+                elif may_begin(view, stop):
                     return begin
             except Damage:
                 continue
-        return len(view)
-
-
-FRAMES = {'zstd': (b'\x28\xb5\x2f\xfd',), 'lz4': (b'\x04\x22\x4d\x18',)}
-
-
-def _frame(view: bytes | mmap.mmap, at: int) -> tuple[int, int]:
-    """Where the content of the record at this place begins and ends."""
-    start = at + RECORD.size
-    if start > len(view):
-        raise Damage('a record is cut off by the end of the file')
-    _, length = RECORD.unpack_from(view, at)
-    if length > len(view) - start:
-        raise Damage('a record reaches beyond the end of the file')
-    return start, start + length
-
-
-def _may_begin(view: bytes | mmap.mmap, at: int) -> bool:
-    """Whether a record, or the end of the file, is here."""
-    if at == len(view):
-        return True
-    try:
-        opcode = view[at]
-        start, stop = _frame(view, at)
-        if opcode == CHUNK:
-            _chunk(view, at)
-        else:
-            _parse(view, opcode, start, stop)
-    except (Damage, IndexError):
-        return False
-    return True
-
-
-def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and stop of the content of each record in a chunk."""
-    at, size = 0, len(content)
-    while at < size:
-        if size - at < RECORD.size:
-            raise Damage('a record in a chunk is cut off')
-        opcode, length = RECORD.unpack_from(content, at)
-        start = at + RECORD.size
-        if opcode not in (SCHEMA, CHANNEL, MESSAGE):
-            raise Damage(f'a chunk holds a record of opcode {opcode}')
-        if length > size - start:
-            raise Damage('a record reaches beyond its chunk')
-        at = start + length
-        yield opcode, start, at
-
-
-def _message(content: bytes | mmap.mmap, start: int, stop: int, trusted: bool) -> Message:
-    head = MESSAGE_HEAD.unpack_from(content, start)
-    return Message(*head, content[start + MESSAGE_HEAD.size : stop], trusted)
-
-
-def _chunk(view: bytes | mmap.mmap, at: int, cut_off: bool = False) -> Chunk:
-    """The chunk at this place, by its head."""
-    start = at + RECORD.size
-    name = start + CHUNK_HEAD.size
-    if name + U64.size > len(view):
-        raise Damage('a chunk is cut off by the end of the file')
-    _, length = RECORD.unpack_from(view, at)
-    _, _, unpacked, crc, letters = CHUNK_HEAD.unpack_from(view, start)
-    if letters > 4 or name + letters + U64.size > len(view):
-        raise Damage('a chunk has a damaged head')
-    compression = view[name : name + letters].decode('ascii', 'replace')
-    if compression not in ('', 'zstd', 'lz4'):
-        raise Damage(f'a chunk has compression {compression!r}; zstd and lz4 are known')
-    (taken,) = U64.unpack_from(view, name + letters)
-    begin = name + letters + U64.size
-    if begin + taken != start + length:
-        raise Damage('a chunk has a damaged head: its two lengths differ')
-    if begin + taken > len(view) and not cut_off:
-        raise Damage('a chunk reaches beyond the end of the file')
-    return Chunk(begin, begin + taken, compression, unpacked, crc)
-
-
-def _unpacked(view: bytes | mmap.mmap, chunk: Chunk) -> bytes:
-    """The content of a chunk, of exactly the size that it states."""
-    packed = view[chunk.start : chunk.stop]
-    try:
-        if chunk.compression == '':
-            content = packed
-        elif chunk.compression == 'zstd':
-            stated = zstandard.frame_content_size(packed)
-            if stated not in (-1, chunk.size):
-                raise Damage(f'a chunk of {chunk.size} bytes unpacks to {stated}')
-            content = zstandard.ZstdDecompressor().decompress(
-                packed, max_output_size=chunk.size or 1
-            )
-        else:
-            unpacker = lz4.frame.LZ4FrameDecompressor()
-            content = unpacker.decompress(packed, max_length=chunk.size + 1)
-    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, ValueError) as error:
-        raise Damage(f'a chunk does not unpack ({error})') from None
-    if len(content) != chunk.size:
-        raise Damage(f'a chunk of {chunk.size} bytes unpacks to another size')
-    return content
-
-
-def is_bounded_zstd(packed: bytes) -> bool:
-    """Whether a zstd frame says to what it unpacks, within the limit."""
-    try:
-        return 0 <= zstandard.frame_content_size(packed) <= LARGEST_CHUNK
-    except zstandard.ZstdError:
-        return False
-
-
-def _unpacked_part(view: bytes | mmap.mmap, chunk: Chunk) -> bytes:
-    """The content of a chunk up to its first damage, of at most the size that it states."""
-    if chunk.whole:
-        return _unpacked(view, chunk)
-    packed = view[chunk.start : min(chunk.stop, len(view))]
-    size = min(chunk.size, LARGEST_CHUNK)
-    if chunk.compression == '':
-        return packed[:size]
-    parts, total = [], 0
-    try:
-        source: io.RawIOBase | zstandard.ZstdDecompressionReader
-        if chunk.compression == 'zstd':
-            source = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK).stream_reader(
-                packed
-            )
-        else:
-            source = lz4.frame.open(io.BytesIO(packed))
-        while total < size:
-            part = source.read(min(STEP, size - total))
-            if not part:
-                break
-            parts.append(part)
-            total += len(part)
-    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, ValueError):
-        pass  # what came before stays
-    return b''.join(parts)
-
-
-def _text(view: bytes | mmap.mmap, at: int, stop: int) -> tuple[str, int]:
-    """A text with its length before it, and where it ends."""
-    if stop - at < U32.size:
-        raise Damage('a text is cut off')
-    (length,) = U32.unpack_from(view, at)
-    begin = at + U32.size
-    if length > stop - begin:
-        raise Damage('a text reaches beyond its record')
-    try:
-        return view[begin : begin + length].decode(), begin + length
-    except UnicodeDecodeError:
-        raise Damage('a text is not UTF-8') from None
-
-
-def _pairs(content: bytes | mmap.mmap, at: int, stop: int) -> tuple[tuple[str, str], ...]:
-    """A map of texts."""
-    pairs = []
-    while at < stop:
-        key, at = _text(content, at, stop)
-        value, at = _text(content, at, stop)
-        pairs.append((key, value))
-    return tuple(pairs)
-
-
-def _parse(content: bytes | mmap.mmap, opcode: int, start: int, stop: int):
-    """What a record says, if it fits its length exactly; Damage otherwise.
-
-    Returns:
-        (channel, sequence, log time) of a message, (number, Schema), (number, Channel),
-        the counts of the statistics; None of any other.
-    """
-    if opcode == MESSAGE:
-        if stop - start < MESSAGE_HEAD.size:
-            raise Damage('a message is shorter than its head')
-        head = MESSAGE_HEAD.unpack_from(content, start)
-        if head[2] > LATEST_NS:
-            raise Damage(f'a message has the impossible time {head[2]} ns')
-        return head[:3]
-    if opcode >= PRIVATE:
-        return None
-    if opcode not in FIELDS:
-        raise Damage(f'a record has the unknown opcode {opcode}')
-    fields, at, values = FIELDS[opcode], start, []
-    for kind in fields:
-        if isinstance(kind, struct.Struct):
-            if stop - at < kind.size:
-                raise Damage('a record is shorter than its fields')
-            values += kind.unpack_from(content, at)
-            at += kind.size
-        elif kind == 'text':
-            text, at = _text(content, at, stop)
-            values.append(text)
-        else:  # a list of entries of that many bytes, or a map of texts, or bytes
-            size, width = _LIST[kind]
-            if stop - at < size.size:
-                raise Damage('a list is cut off')
-            (length,) = size.unpack_from(content, at)
-            at += size.size
-            if length > stop - at or length % width:
-                raise Damage('a list does not fit its record')
-            values.append((at, at + length))
-            at += length
-    if at != stop:
-        raise Damage('a record is longer than its fields')
-    if opcode == SCHEMA:
-        number, name, encoding, definition = values
-        return number, Schema(name, encoding, definition, False)
-    if opcode == METADATA:
-        _pairs(content, *values[-1])
-    if opcode == CHANNEL:
-        number, schema, topic, encoding, place = values
-        return number, Channel(schema, topic, encoding, _pairs(content, *place))
-    if opcode == STATISTICS:
-        at, stop = values[-1]
-        return dict(struct.iter_unpack('<HQ', content[at:stop]))
-    return None
-
-
-_LIST = {
-    'bytes': (U64, 1), 'map': (U32, 1), 'index': (U32, 16), 'offsets': (U32, 10),
-}  # fmt: skip
-FIELDS: dict[int, tuple] = {
-    HEADER: ('text', 'text'),
-    FOOTER: (struct.Struct('<QQI'),),
-    SCHEMA: (struct.Struct('<H'), 'text', 'text', 'text'),
-    CHANNEL: (struct.Struct('<HH'), 'text', 'text', 'map'),
-    0x07: (struct.Struct('<H'), 'index'),  # message index
-    0x08: (struct.Struct('<QQQQ'), 'offsets', U64, 'text', U64, U64),  # chunk index
-    0x09: (U64, U64, 'text', 'text', 'bytes', U32),  # attachment
-    0x0A: (struct.Struct('<QQQQQ'), 'text', 'text'),  # attachment index
-    STATISTICS: (struct.Struct('<QHIIIIQQ'), 'offsets'),
-    METADATA: ('text', 'map'),
-    0x0D: (U64, U64, 'text'),  # metadata index
-    0x0E: (struct.Struct('<BQQ'),),  # summary offset
-    DATA_END: (U32,),
-}
+        return end

@@ -30,7 +30,8 @@ from rosbags.typesys.store import Typestore
 from cg_sysid.bag_file import BagWriter
 from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
 from cg_sysid.journal import STATUS_TOPIC, TYPE_KEY
-from cg_sysid.mcap_scan import MAGIC, Gap, Survey, messages, survey
+from cg_sysid.mcap_records import MAGIC
+from cg_sysid.mcap_scan import Gap, Survey, messages, survey
 
 from cg_sysid.progress import Bars
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -15,7 +17,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from cg_sysid import bag_file
-from cg_sysid.mcap_scan import CHUNK, MAGIC, RECORD
+from cg_sysid.mcap_records import CHUNK, MAGIC, RECORD
 from cg_sysid.recorder import Recording
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -154,9 +156,6 @@ def make_original(kind: str, folder: Path, samples: int) -> Original:
 
 
 def _messages_of(data: bytes, at: int, stop: int, by_content) -> list:
-    import lz4.frame
-    import zstandard
-
     if data[at] == 5:
         return [by_content[data[at + RECORD.size + 22 : stop]]]
     letters = struct.unpack_from('<I', data, at + CRC_AT + 4)[0]

@@ -24,7 +24,8 @@ from mutated_files import (
 
 from cg_sysid.bags import read_bag
 from cg_sysid.errors import RecordingError
-from cg_sysid.mcap_scan import LARGEST_CHUNK, MAGIC, survey
+from cg_sysid.mcap_records import LARGEST_CHUNK, MAGIC
+from cg_sysid.mcap_scan import survey
 from cg_sysid.recover import RecoveryError, is_damaged, main, recover
 
 MUTANTS = 3  # of each kind of file and damage; bench/mutated_bags.py takes 10^5
@@ -38,6 +39,15 @@ def originals(tmp_path_factory):
     return {kind: make_original(kind, folder, samples=20) for kind in FILES}
 
 
+def refusal(task, bag):
+    """What the error says with which a bag is refused; empty if it is not."""
+    try:
+        task(bag)
+    except (RecoveryError, RecordingError) as error:
+        return str(error)
+    return ''
+
+
 @pytest.mark.parametrize('damage', DAMAGES)
 @pytest.mark.parametrize('kind', FILES)
 def test_recover_keeps_what_is_intact(tmp_path, originals, kind, damage):
@@ -46,11 +56,10 @@ def test_recover_keeps_what_is_intact(tmp_path, originals, kind, damage):
         changed = DAMAGES[damage](original.data, rng)
         bag = place(tmp_path / 'bag', original, changed)
         wanted, found = intact(original, changed), set()
-        try:
-            recover(bag)
+        if refusal(recover, bag):
+            assert 'no message that can be read' in refusal(recover, bag)
+        else:
             found = set(content_of(bag))
-        except RecoveryError as error:
-            assert 'no message that can be read' in str(error)
         if damage != 'eight bits':  # which may hit every copy of a channel
             assert wanted <= found
         if kind in CHECKED and damage != 'eight bits':
@@ -81,12 +90,11 @@ def test_readers_say_in_one_line_what_is_wrong(tmp_path, write):
             file.write_bytes(data)
             text = damage(metadata.encode(), rng)
             (file.parent / 'metadata.yaml').write_bytes(text)
-        try:
-            read_bag(file.parent)
-        except RecordingError as error:
+        said = refusal(read_bag, file.parent)
+        if said:
             refused += 1
-            assert str(tmp_path) in str(error)
-            assert '\n' not in str(error)
+            assert str(tmp_path) in said
+            assert '\n' not in said
         (file.parent / 'metadata.yaml').write_text(metadata)
     assert refused > 30
 
@@ -148,10 +156,10 @@ def test_a_bomb_stops_at_the_limit(tmp_path, packed, compression, size):
     file.write_bytes(MAGIC + header + chunk(packed, compression, size, crc) + end)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     began = time.process_time()
-    with pytest.raises(RecoveryError, match='unpacks? to|does not') as caught:
+    with pytest.raises(RecoveryError, match=r'unpacks? to|does not') as caught:
         recover(file)
     assert '\n' not in str(caught.value)
-    with pytest.raises(RecordingError, match='unpacks? to|does not'):
+    with pytest.raises(RecordingError, match=r'unpacks? to|does not'):
         read_bag(file)
     # Twice the largest chunk in kB; a gigabyte takes longer than this to unpack.
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2.5 * LARGEST_CHUNK / 1024
