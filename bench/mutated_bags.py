@@ -4,8 +4,9 @@
 
 Every mutant is looked through and all that is intact is taken out of it, as `recover` does; one
 in fifty goes the whole way to a bag on disk, which the mcap library then reads. One in five of
-the mutants of bags with metadata.yaml also goes to `read_bag`. The files and damages are those of the fuzz test
-(src/cg_sysid/test/mutated_files.py). `--write` stores the table as bench/results/mutated_bags.md.
+the mutants of bags with metadata.yaml also goes to `read_bag`. The files and damages are those
+of the fuzz test (src/cg_sysid/test/mutated_files.py). `--write` stores the table as
+bench/results/mutated_bags.md.
 """
 
 import argparse

@@ -153,7 +153,8 @@ def started_in_the_middle(folder: Path, count: int) -> list[tuple[float, int, in
             int(((sent >= values[0]) & (sent <= values[-1])).sum()) - len(values)
             for values in stamps.values()
         )
-        rows.append((1e-6 * (max(firsts) - min(firsts)), lost, notes, 'began_late' in told(bag)))
+        spread = float(1e-6 * (max(firsts) - min(firsts)))
+        rows.append((spread, lost, notes, 'began_late' in told(bag)))
         print('middle', rows[-1], flush=True)
     return rows
 
@@ -176,7 +177,7 @@ def killed(folder: Path, count: int, load: int) -> list[tuple[float, float]]:
         stamps.pop('/experiment')
         oldest = min(values[-1] for values in stamps.values())
         late = max([0.0, *told(bag).get('received_late', {}).values()])
-        rows.append((1e-6 * max(newest - oldest, 0), 1e3 * late))
+        rows.append((float(1e-6 * max(newest - oldest, 0)), 1e3 * late))
         print('killed', load, rows[-1], flush=True)
     return rows
 
@@ -195,8 +196,7 @@ def busy(load: int) -> Iterator[None]:
             process.wait()
 
 
-def table(middle: list, losses: dict[int, list], command: str) -> str:
-    around = os.getloadavg()[0]
+def table(middle: list, losses: dict[int, list], around: float, command: str) -> str:
     lines = [
         '# The recorder, started late and killed', '', f'Command: `{command}`. '
         f'{os.cpu_count()} cores; other work made a load of about {around:.0f}.', '',
@@ -231,6 +231,7 @@ def main() -> None:
     parser.add_argument('--write', action='store_true')
     options = parser.parse_args()
     loads = [int(load) for load in options.loads.split(',')]
+    around = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         middle = started_in_the_middle(folder, options.starts)
@@ -239,7 +240,7 @@ def main() -> None:
         f'./cg exec python bench/recorder.py --starts {options.starts} --kills {options.kills} '
         f'--loads {options.loads} --write'
     )
-    text = table(middle, losses, command)
+    text = table(middle, losses, around, command)
     print(text)
     if options.write:
         write_atomically(RESULT, text)

@@ -54,6 +54,7 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
+        'lz4',
         'matplotlib',
         'mcap',
         'numpy',

@@ -24,6 +24,7 @@ from cg_sysid.recover import JOURNAL_NAME, Recovered, recover
 
 STAMP = struct.Struct('<iI')  # at byte 4 of a serialised message that begins with a Header
 HEADER_OFFSET = 4
+SAME_CLOCK_NS = 10_000_000_000  # stamps this near to the receipt are of the recorder's clock
 WRENCH = 'geometry_msgs/msg/WrenchStamped'
 EXTRA_TOPICS = {
     'compass_gait': {'/foot_contact/inner': WRENCH, '/foot_contact/outer': WRENCH},
@@ -191,16 +192,20 @@ class Recording:
         kept. So it is if some are silent: then what there is counts.
 
         Returns:
-            The log time where the bag begins in ns; 0 if everything is kept.
+            Where the bag begins in ns; 0 if everything is kept. A stamp where stamps are of the
+            recorder's clock, a log time elsewhere.
         """
         expected = [self._topics[name] for name in self._expected if name in self._topics]
-        begin_ns = 0
+        heard = [topic for name, topic in self._topics.items() if name != NOTE_TOPIC]
+        begin_ns, by = 0, 'receipt'
         if not self.silent and len({topic.first_stamp_ns for topic in expected}) > 1:
-            begin_ns = max(
-                topic.first_log_ns for name, topic in self._topics.items() if name != NOTE_TOPIC
-            )
+            begin_ns = max(topic.first_log_ns for topic in heard)
+            delays = [topic.first_log_ns - topic.first_stamp_ns for topic in heard]
+            if max(abs(delay) for delay in delays) < SAME_CLOCK_NS:
+                # What a busy machine held up comes in after others that were sent later.
+                begin_ns, by = max(topic.first_stamp_ns for topic in heard), 'stamp'
         self.begun = True
-        self._status['begin_ns'] = begin_ns
+        self._status |= {'begin_ns': begin_ns, 'begin_by': by}
         self._journal.set_status(self._status, begin_ns)
         return begin_ns
 

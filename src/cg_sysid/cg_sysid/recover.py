@@ -30,7 +30,7 @@ from rosbags.typesys.store import Typestore
 from cg_sysid.bag_file import BagWriter
 from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
 from cg_sysid.journal import STATUS_TOPIC, TYPE_KEY
-from cg_sysid.mcap_records import MAGIC
+from cg_sysid.mcap_records import LATEST_NS, MAGIC
 from cg_sysid.mcap_scan import Gap, Survey, messages, survey
 
 from cg_sysid.progress import Bars
@@ -167,7 +167,7 @@ class Topic:
     qos: list[Qos]
     count: int = 0
     undecodable: int = 0
-    first_ns: int = 0
+    first_ns: int = 0  # of its first message in the bag
     delays: tuple[int, int] | None = None  # shortest and longest, ns
 
     def note_delay(self, delay: int) -> None:
@@ -185,6 +185,16 @@ class Contents:
     status: dict[str, Any] = field(default_factory=dict)
     unknown: Counter[str] = field(default_factory=Counter)
     left_out: int = 0
+
+    @property
+    def begin_ns(self) -> int:
+        """Where the bag begins; 0 where nothing is left out for it."""
+        return self.status.get('begin_ns', 0)
+
+    @property
+    def by_stamp(self) -> bool:
+        """Whether that is a stamp, and no log time."""
+        return self.status.get('begin_by') == 'stamp'
 
 
 def needs_recovery(path: str | Path) -> bool:
@@ -268,7 +278,7 @@ def _make(staged: Path, sources: list[Path], target: Path) -> Recovered:
     with writer:
         begun, count = _write(writer, contents)
         # Only now is everything known; metadata.yaml is written at the end.
-        result = _result(target, contents, begun, count)
+        result = _result(target, contents, contents.begin_ns or begun, count)
         for key, value in _custom_data(result).items():
             writer.set_custom_data(key, value)
     return result
@@ -292,13 +302,24 @@ def _learn_status(contents: Contents) -> None:
             continue
         for message in messages(found):
             if found.channels[message.channel].topic == STATUS_TOPIC and message.trusted:
-                with contextlib.suppress(ValueError, RecursionError):
-                    contents.status = dict(json.loads(message.data))
+                with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
+                    contents.status = _checked_status(json.loads(message.data))
+
+
+def _checked_status(status: Any) -> dict[str, Any]:
+    """What a status may hold; the rest of it left out."""
+    begin_ns = status.get('begin_ns')
+    return {
+        'begin_ns': begin_ns if isinstance(begin_ns, int) and 0 <= begin_ns <= LATEST_NS else 0,
+        'begin_by': status.get('begin_by'),
+        'qos': dict(status.get('qos', {})),
+        'expected': [str(topic) for topic in status.get('expected', ())],
+    }
 
 
 def entries(contents: Contents) -> Iterator[Entry]:
     """Every intact message of known type from where the bag begins on."""
-    begin_ns = contents.status.get('begin_ns') or 0
+    begin_ns = contents.begin_ns
     for found in contents.surveys:
         topics = _topics(found, contents)
         for message in messages(found):
@@ -311,13 +332,15 @@ def entries(contents: Contents) -> Iterator[Entry]:
                 topic.undecodable += 1
                 continue
             log_ns = message.log_ns
-            if log_ns < begin_ns:
+            time_ns = message.publish_ns if contents.by_stamp else log_ns
+            if time_ns < begin_ns:
                 if topic.name != NOTE_TOPIC:
                     contents.left_out += 1
                     continue
-                log_ns = begin_ns  # it is latched: what it says still holds
-            if topic.count == 0 or log_ns < topic.first_ns:
-                topic.first_ns = log_ns
+                # It is latched: what it says still holds.
+                log_ns = time_ns = begin_ns
+            if topic.count == 0 or time_ns < topic.first_ns:
+                topic.first_ns = time_ns
             topic.note_delay(message.log_ns - message.publish_ns)
             topic.count += 1
             yield Entry(log_ns, topic.name, topic.count, message.data)

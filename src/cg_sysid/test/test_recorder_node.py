@@ -1,4 +1,4 @@
-"""SIGKILL at full rate loses at most 20 ms; measured by killing."""
+"""SIGKILL at full rate loses at most 20 ms, and a late start nothing after the beginning."""
 
 import contextlib
 import os
@@ -12,11 +12,13 @@ from rosbags.highlevel import AnyReader
 
 rclpy = pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import WrenchStamped  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 
 from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import MACHINE_QOS, to_stamp  # noqa: E402
+from cg_dynamics.ros import LATCHED_QOS, MACHINE_QOS, to_stamp  # noqa: E402
 from cg_sysid.recover import needs_recovery, recover  # noqa: E402
 
 pytestmark = pytest.mark.alone
@@ -29,29 +31,35 @@ TOPICS = {
     '/applied_torque': JointState,
     '/torque_command': JointState,
 }
+EXPECTED = {
+    **TOPICS,
+    '/foot_contact/inner': WrenchStamped,
+    '/foot_contact/outer': WrenchStamped,
+}
 
 
 @contextlib.contextmanager
-def make_sender():
+def make_sender(topics=None):
     # A domain each: subscriptions of a killed recorder linger in its own.
     with own_domain():
         rclpy.init()
         node = Node('sender')
-        yield Sender(node)
+        yield Sender(node, topics or TOPICS)
         node.destroy_node()
         rclpy.try_shutdown()
 
 
 class Sender:
-    """Publishes four topics at 500 Hz from this thread."""
+    """Publishes topics at 500 Hz from this thread."""
 
-    def __init__(self, node):
+    def __init__(self, node, topics):
+        self.node = node
         self.sent = []  # stamps in ns
         self.publishers = {
             topic: node.create_publisher(kind, topic, MACHINE_QOS)
-            for topic, kind in TOPICS.items()
+            for topic, kind in topics.items()
         }
-        self.messages = {
+        self.messages = {topic: kind() for topic, kind in topics.items()} | {
             '/imu': Imu(),
             **{
                 topic: JointState(name=['hip'], position=[0.1], effort=[1.0])
@@ -82,16 +90,19 @@ class Sender:
         return worst
 
 
-def start_recorder(bag):
+def start_recorder(bag, **options):
     return subprocess.Popen(
-        [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p', f'bag:={bag}']
+        [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p', f'bag:={bag}'],
+        **options,
     )
 
 
-def stamps_of(bag):
+def stamps_of(bag, without=''):
     stamps = {}
     with AnyReader([bag]) as reader:
         for connection, _, data in reader.messages():
+            if connection.topic == without:
+                continue
             stamp = reader.deserialize(data, connection.msgtype).header.stamp
             stamps.setdefault(connection.topic, []).append(stamp.sec * 10**9 + stamp.nanosec)
     return stamps
@@ -143,6 +154,34 @@ def test_sigint_closes_the_bag_and_every_message_is_there(tmp_path):
     assert set(stored) == set(TOPICS)
     for stamps in stored.values():
         assert stamps[-len(sender.sent) :] == sender.sent
+
+
+def test_started_while_data_flow_the_bag_begins_with_all_topics_and_the_note(tmp_path):
+    bag = tmp_path / 'bag'
+    with make_sender(EXPECTED) as sender:
+        notes = sender.node.create_publisher(String, '/experiment', LATCHED_QOS)
+        notes.publish(String(data='mechanism: compass_gait'))
+        sender.send(0.1)
+        process = start_recorder(bag, stderr=subprocess.PIPE, text=True)
+        os.set_blocking(process.stderr.fileno(), False)
+        said, deadline = '', time.monotonic() + 30.0
+        while 'all topics are heard' not in said:
+            assert time.monotonic() < deadline, said
+            sender.send(0.05)
+            said += process.stderr.read() or ''
+        sender.send(0.1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20.0) == 0
+        process.stderr.close()
+    with AnyReader([bag]) as reader:
+        notes = [c for c, _, _ in reader.messages() if c.topic == '/experiment']
+    assert len(notes) == 1
+    stored = stamps_of(bag, without='/experiment')
+    assert set(stored) == set(EXPECTED)
+    first = max(stamps[0] for stamps in stored.values())
+    for stamps in stored.values():
+        assert stamps[0] == first
+        assert stamps == [stamp for stamp in sender.sent if first <= stamp <= stamps[-1]]
 
 
 @pytest.mark.parametrize(

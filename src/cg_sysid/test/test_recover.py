@@ -147,7 +147,7 @@ def test_a_flipped_bit_costs_its_message_and_is_told(tmp_path):
         assert reader.message_count == 200
 
 
-def test_messages_are_told_apart_from_those_that_were_never_expected(tmp_path):
+def test_the_bag_begins_where_the_last_expected_topic_does(tmp_path):
     recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
     for topic in TOPICS:
         recording.announce(topic, [])
@@ -160,12 +160,26 @@ def test_messages_are_told_apart_from_those_that_were_never_expected(tmp_path):
     assert recording.silent == ()
     begin_ns = recording.begin()
     result = recording.close()
-    assert begin_ns == 2 * 10**9 + 40 * MS + 1
-    assert result.left_out == 21
+    assert begin_ns == 2 * 10**9 + 40 * MS
+    assert result.left_out == 20
     # The note is latched: it holds from the beginning on, though it came before.
-    assert content(tmp_path / 'bag')[0][:2] == ('/experiment', begin_ns)
-    assert {t for _, t, _ in content(tmp_path / 'bag')} >= {begin_ns, begin_ns - 1 + 2 * MS}
+    assert [(topic, t) for topic, t, _ in content(tmp_path / 'bag')[:3]] == [
+        ('/applied_torque', begin_ns), ('/experiment', begin_ns), ('/hip_encoder', begin_ns + 1)
+    ]  # fmt: skip
     assert not result.began_late
+
+
+def test_stamps_of_another_clock_do_not_decide_where_the_bag_begins(tmp_path):
+    recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
+    for topic in TOPICS:
+        recording.announce(topic, [])
+    for k in range(50):
+        log = 2000 * 10**9 + 2 * MS * k
+        recording.write('/applied_torque', joint_state(log, k), log, 0.0)
+        if k >= 20:
+            recording.write('/hip_encoder', joint_state(10**9 + 2 * MS * k, k), log + 1, 0.0)
+    assert recording.begin() == 2000 * 10**9 + 40 * MS + 1
+    assert recording.close().left_out == 21
 
 
 def test_nothing_is_left_out_if_all_began_with_one_stamp(tmp_path):
