@@ -72,6 +72,11 @@ class Chunk(NamedTuple):
     crc: int
     whole: bool = True
 
+    @property
+    def head_size(self) -> int:
+        """Bytes from the opcode to the content."""
+        return RECORD.size + CHUNK_HEAD.size + len(self.compression) + U64.size
+
 
 # How packed content begins.
 FRAMES = {'zstd': b'\x28\xb5\x2f\xfd', 'lz4': b'\x04\x22\x4d\x18'}

@@ -65,6 +65,7 @@ REST_OF_HEAD = re.compile(
 )
 TYPE_NAME = re.compile(r'\w+/(msg/)?\w+', re.ASCII)
 TOPIC_NAME = re.compile(r'/[\w/~]+', re.ASCII)
+LONGEST_HEAD = 61  # bytes from the opcode of a chunk to its content
 LARGEST_RATIO = 1000  # a file may unpack to this many times its size and one largest chunk
 
 
@@ -374,6 +375,10 @@ class _Surveyor:
             if view[at] == CHUNK:
                 chunk_at(view, at)
             if view[at] <= DATA_END and may_begin(view, stop):
+                # Unless the beginning of the next chunk lies in it.
+                chunk = self._headless(at, min(stop + LONGEST_HEAD, size))
+                if chunk is not None and chunk.start - chunk.head_size < stop:
+                    return self._take_headless(at, chunk, reason)
                 self._gap(at, stop, reason)
                 return stop
         resumed = self._next(at + 1)
