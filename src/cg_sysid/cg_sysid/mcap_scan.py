@@ -462,8 +462,10 @@ class _Surveyor:
         """The next place, before the end, at which a record surely begins; the end without one."""
         view = self.view
         end = len(view) if end is None else end
-        for match in CANDIDATE.finditer(view, at, end):
+        for match in CANDIDATE.finditer(view, at, min(end + RECORD.size, len(view))):
             begin = match.start()
+            if begin >= end:
+                break
             try:
                 opcode = view[begin]
                 start, stop = frame(view, begin)
