@@ -9,13 +9,14 @@ from pathlib import Path
 
 import zstandard
 
+from cg_description.reading import Limits, parse_yaml, read_text
 from cg_sysid.errors import RecordingError
 from cg_sysid.mcap_records import LARGEST_CHUNK, MAGIC, is_bounded_zstd
 from cg_sysid.mcap_scan import LARGEST_RATIO, Survey, messages, survey
 from cg_sysid.recover import METADATA, needs_recovery
 
 LOGS = ('.csv', '.mat', '.json')  # what an import is needed for
-LARGEST_METADATA = 1024 * 1024  # bytes
+METADATA_LIMITS = Limits(size=1024 * 1024, depth=40, nodes=100_000)
 STEP = 1024 * 1024
 
 
@@ -40,18 +41,16 @@ def _require_sound(path: Path) -> None:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     packed_messages = False
     if path.is_dir():
-        metadata = path / METADATA
-        if metadata.stat().st_size > LARGEST_METADATA:
-            raise RecordingError(
-                f'{metadata} has {metadata.stat().st_size} bytes; at most {LARGEST_METADATA} '
-                'are allowed'
-            )
-        packed_messages = b'message' in _compression_mode(metadata)
+        packed_messages = _checked_metadata(path / METADATA) == 'message'
     for file in files:
         if file.suffix == '.mcap':
             found = survey(file)
             if not found.sound:
                 raise damaged(path, found)
+            for channel in found.channels.values():
+                for key, value in channel.metadata:
+                    if key == 'offered_qos_profiles':
+                        parse_yaml(value, f'{file}: {channel.topic}: {key}', RecordingError)
             if packed_messages:
                 _require_bounded(file, (message.data for message in messages(found)))
         elif file.suffix == '.db3' and packed_messages:
@@ -60,9 +59,23 @@ def _require_sound(path: Path) -> None:
             _require_bounded_file(file)
 
 
-def _compression_mode(metadata: Path) -> bytes:
-    lines = metadata.read_bytes().splitlines()
-    return b''.join(line for line in lines if b'compression_mode' in line).lower()
+def _checked_metadata(file: Path) -> str:
+    """The mode of compression; RecordingError if nobody should read this file."""
+    tree = parse_yaml(read_text(file, RecordingError, METADATA_LIMITS), str(file), RecordingError,
+                      METADATA_LIMITS)  # fmt: skip
+    try:
+        information = tree['rosbag2_bagfile_information']
+        for topic in information['topics_with_message_count']:
+            # A text of YAML in older bags.
+            qos = topic['topic_metadata'].get('offered_qos_profiles')
+            if isinstance(qos, str):
+                parse_yaml(qos, f'{file}: offered_qos_profiles', RecordingError)
+        return str(information.get('compression_mode', '')).lower()
+    except (KeyError, TypeError, AttributeError):
+        raise RecordingError(
+            f'{file}: not a readable rosbag2 recording: `rosbag2_bagfile_information` with its '
+            '`topics_with_message_count` is needed'
+        ) from None
 
 
 def _rows(file: Path):

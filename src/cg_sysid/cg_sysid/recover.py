@@ -21,12 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from cg_description.reading import parse_json, parse_yaml
 from cg_sysid.bag_file import BagWriter
 from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
 from cg_sysid.journal import STATUS_TOPIC, TYPE_KEY
@@ -41,7 +41,6 @@ METADATA = 'metadata.yaml'
 DAMAGED = '.damaged'
 REORDER_NS = 1_000_000_000  # messages are sorted by log time within this horizon
 LATE_NS = 20_000_000  # what is later than this is told in the bag
-LARGEST_QOS = 8192  # characters of offered QoS profiles; a profile takes 350
 LOSSES_SHOWN = 20
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
@@ -302,8 +301,9 @@ def _learn_status(contents: Contents) -> None:
             continue
         for message in messages(found):
             if found.channels[message.channel].topic == STATUS_TOPIC and message.trusted:
-                with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
-                    contents.status = _checked_status(json.loads(message.data))
+                with contextlib.suppress(ValueError, TypeError, AttributeError):
+                    status = parse_json(message.data.decode(), STATUS_TOPIC, ValueError)
+                    contents.status = _checked_status(status)
 
 
 def _checked_status(status: Any) -> dict[str, Any]:
@@ -426,14 +426,9 @@ def _qos(profiles: Any) -> list[Qos]:
     """Offered QoS, from a list or YAML text; none if it is not what it should be."""
     try:
         if isinstance(profiles, str):
-            # Nothing that anybody offers is nested deeper, or refers to itself.
-            if len(profiles) > LARGEST_QOS or profiles.count('- -') or '&' in profiles:
-                return []
-            if profiles.count('[') + profiles.count('{') > LARGEST_QOS // 100:
-                return []
-            profiles = yaml.safe_load(profiles)
+            profiles = parse_yaml(profiles, 'offered QoS', ValueError)
         return parse_qos(list(profiles or []))
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError):
         return []
 
 
