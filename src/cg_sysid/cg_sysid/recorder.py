@@ -185,11 +185,15 @@ class Recording:
             if name not in self._topics or self._topics[name].count == 0
         )
 
-    def begin(self) -> int:
+    def begin(self, was_ready: bool = False) -> int:
         """Say where the bag begins: where the last of the topics did that are heard by now.
 
-        If all expected topics began with the same stamp, nothing was missed, and everything is
-        kept. So it is if some are silent: then what there is counts.
+        Everything is kept if nothing can have been missed, because all expected topics began with
+        the same stamp while the recorder was ready, or if some are silent: then what there is
+        counts.
+
+        Args:
+            was_ready: Whether every topic had been matched when the first sample came.
 
         Returns:
             Where the bag begins in ns; 0 if everything is kept. A stamp where stamps are of the
@@ -198,14 +202,16 @@ class Recording:
         expected = [self._topics[name] for name in self._expected if name in self._topics]
         heard = [topic for name, topic in self._topics.items() if name != NOTE_TOPIC]
         begin_ns, by = 0, 'receipt'
-        if not self.silent and len({topic.first_stamp_ns for topic in expected}) > 1:
+        together = was_ready and len({topic.first_stamp_ns for topic in expected}) == 1
+        if expected and not self.silent and not together:
             begin_ns = max(topic.first_log_ns for topic in heard)
             delays = [topic.first_log_ns - topic.first_stamp_ns for topic in heard]
             if max(abs(delay) for delay in delays) < SAME_CLOCK_NS:
                 # What a busy machine held up comes in after others that were sent later.
                 begin_ns, by = max(topic.first_stamp_ns for topic in heard), 'stamp'
         self.begun = True
-        self._status |= {'begin_ns': begin_ns, 'begin_by': by}
+        # As a text: not every reader of JSON keeps all digits of an integer.
+        self._status |= {'begin_ns': str(begin_ns), 'begin_by': by}
         self._journal.set_status(self._status, begin_ns)
         return begin_ns
 

@@ -28,7 +28,7 @@ from cg_sysid.recorder import (
 PROGRESS_TOPIC = '/recorder/progress'
 PROGRESS_PERIOD = 0.002  # s
 READY_PERIOD = 0.02  # s
-SETTLING = 0.5  # s that topics which need not speak are given to begin
+SETTLING = 0.5  # s without news after which all publishers are known; nothing waits for it
 NICENESS = -15  # far before ordinary work, behind nothing that keeps a machine alive
 
 
@@ -53,8 +53,11 @@ class RecorderNode(Node):
         )
         self.patience = settings.patience
         self._first_sample_at: float | None = None
+        self._was_ready = False
         self._note_heard = False
         self._look_at = 0.0
+        self._scene: list[tuple[int, bool]] = []
+        self._scene_at = 0.0
         # Waiting messages of all topics share one thread; the depth rides out a busy machine.
         qos = QoSProfile(depth=settings.depth, reliability=ReliabilityPolicy.RELIABLE)
         self.progress = self.create_publisher(Header, PROGRESS_TOPIC, SENSOR_QOS)
@@ -92,6 +95,7 @@ class RecorderNode(Node):
             self._note_heard = True
         elif self._first_sample_at is None:
             self._first_sample_at = time.monotonic()
+            self._was_ready = self._told_at > 0.0
         if self.recording.begun and topic in self.needed:
             self.get_logger().warning(f'{topic} began late')
 
@@ -132,16 +136,16 @@ class RecorderNode(Node):
         waited = now - self._first_sample_at
         if missing and waited < self.patience:
             return
-        if self._quiet() and waited < min(SETTLING, self.patience):
+        if not self._settled(now) and waited < self.patience:
             return
         if missing:
-            self.recording.begin()
+            self.recording.begin(self._was_ready)
             self.get_logger().warning(
                 f'recording begins after {waited:.3f} s without {", ".join(missing)}; the bag '
                 'tells how late they begin'
             )
             return
-        begin_ns = self.recording.begin()
+        begin_ns = self.recording.begin(self._was_ready)
         left_out = '; what came before the last of them began is left out' if begin_ns else ''
         self.get_logger().info(f'all topics are heard, {waited:.3f} s after the first{left_out}')
 
@@ -153,12 +157,15 @@ class RecorderNode(Node):
             if subscription.get_publisher_count() < self.count_publishers(topic)
         ]
 
-    def _quiet(self) -> bool:
-        """Whether a topic has a publisher and has said nothing yet."""
-        return any(
-            subscription.get_publisher_count() and not self.recording.knows(topic)
-            for topic, subscription in self.subscriptions_to.items()
-        )
+    def _settled(self, now: float) -> bool:
+        """Whether no publisher has come and no topic has begun for a while."""
+        scene = [
+            (self.count_publishers(topic), self.recording.knows(topic))
+            for topic in self.subscriptions_to
+        ]
+        if scene != self._scene:
+            self._scene, self._scene_at = scene, now
+        return now >= self._scene_at + SETTLING
 
     def _hears_all(self) -> bool:
         # Asked of the readers: a writer that has matched a reader may not be matched by it yet.

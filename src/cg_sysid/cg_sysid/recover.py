@@ -308,9 +308,9 @@ def _learn_status(contents: Contents) -> None:
 
 def _checked_status(status: Any) -> dict[str, Any]:
     """What a status may hold; the rest of it left out."""
-    begin_ns = status.get('begin_ns')
+    begin_ns = int(str(status.get('begin_ns', 0))[:20])
     return {
-        'begin_ns': begin_ns if isinstance(begin_ns, int) and 0 <= begin_ns <= LATEST_NS else 0,
+        'begin_ns': begin_ns if 0 <= begin_ns <= LATEST_NS else 0,
         'begin_by': status.get('begin_by'),
         'qos': dict(status.get('qos', {})),
         'expected': [str(topic) for topic in status.get('expected', ())],

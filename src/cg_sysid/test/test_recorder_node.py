@@ -162,17 +162,16 @@ def test_started_while_data_flow_the_bag_begins_with_all_topics_and_the_note(tmp
         notes = sender.node.create_publisher(String, '/experiment', LATCHED_QOS)
         notes.publish(String(data='mechanism: compass_gait'))
         sender.send(0.1)
-        process = start_recorder(bag, stderr=subprocess.PIPE, text=True)
-        os.set_blocking(process.stderr.fileno(), False)
-        said, deadline = '', time.monotonic() + 30.0
-        while 'all topics are heard' not in said:
-            assert time.monotonic() < deadline, said
+        log = tmp_path / 'log'
+        with log.open('w') as output:
+            process = start_recorder(bag, stderr=output)
+        deadline = time.monotonic() + 30.0
+        while 'all topics are heard' not in log.read_text():
+            assert time.monotonic() < deadline, log.read_text()
             sender.send(0.05)
-            said += process.stderr.read() or ''
         sender.send(0.1)
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20.0) == 0
-        process.stderr.close()
     with AnyReader([bag]) as reader:
         notes = [c for c, _, _ in reader.messages() if c.topic == '/experiment']
     assert len(notes) == 1

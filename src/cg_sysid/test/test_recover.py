@@ -29,6 +29,7 @@ QOS = {
     'avoid_ros_namespace_conventions': False,
 }  # fmt: skip
 MS = 1_000_000
+TODAY = 1_300_000_000_123_456_789  # ns, with all the digits of a real time
 
 
 def joint_state(stamp_ns, value):
@@ -151,16 +152,16 @@ def test_the_bag_begins_where_the_last_expected_topic_does(tmp_path):
     recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
     for topic in TOPICS:
         recording.announce(topic, [])
-    recording.write('/experiment', note('mechanism: compass_gait'), 10**9, 0.0)
+    recording.write('/experiment', note('mechanism: compass_gait'), TODAY, 0.0)
     for k in range(50):
-        log = 2 * 10**9 + 2 * MS * k
+        log = TODAY + 10**9 + 2 * MS * k
         recording.write('/applied_torque', joint_state(log, k), log, 0.0)
         if k >= 20:
             recording.write('/hip_encoder', joint_state(log, k), log + 1, 0.0)
     assert recording.silent == ()
     begin_ns = recording.begin()
     result = recording.close()
-    assert begin_ns == 2 * 10**9 + 40 * MS
+    assert begin_ns == TODAY + 10**9 + 40 * MS
     assert result.left_out == 20
     # The note is latched: it holds from the beginning on, though it came before.
     assert [(topic, t) for topic, t, _ in content(tmp_path / 'bag')[:3]] == [
@@ -182,14 +183,14 @@ def test_stamps_of_another_clock_do_not_decide_where_the_bag_begins(tmp_path):
     assert recording.close().left_out == 21
 
 
-def test_nothing_is_left_out_if_all_began_with_one_stamp(tmp_path):
+def test_nothing_is_left_out_if_all_began_together_while_ready(tmp_path):
     recording = Recording(tmp_path / 'bag', TOPICS, False, ('/applied_torque', '/hip_encoder'))
     for topic in TOPICS:
         recording.announce(topic, [])
     for k in range(5):
         for delay, topic in ((0, '/applied_torque'), (30 * MS, '/hip_encoder')):
             recording.write(topic, joint_state(10**9 + k, k), 10**9 + 2 * MS * k + delay, 0.0)
-    assert recording.begin() == 0
+    assert recording.begin(was_ready=True) == 0
     result = recording.close()
     assert (result.messages, result.left_out) == (10, 0)
     assert result.began_late == {'/hip_encoder': pytest.approx(0.03)}
