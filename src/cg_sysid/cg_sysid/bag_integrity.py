@@ -139,7 +139,7 @@ def no_bag(path: Path) -> RecordingError:
         folder = path.parent if path.is_file() else path
         return RecordingError(
             f'{path}: {kind}, no bag; a mapping file says which column is which channel, then '
-            f'`python3 -m cg_sysid.importing MAPPING.yaml {folder} --out bags` makes bags of it '
+            f'`cg import MAPPING.yaml {folder} --out bags` makes bags of it '
             '(docs/data.md, "Import of foreign logs")'
         )
     return RecordingError(

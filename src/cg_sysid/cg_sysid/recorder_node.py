@@ -1,7 +1,10 @@
 """ROS node of the recorder: raw subscriptions into a bag. What is on disk: recorder.py.
 
-A message is written when it comes in. A SIGKILL loses what had not come in; `ros2 run cg_sysid
-recover BAG` makes a bag of the rest. SIGINT and SIGTERM close the bag properly.
+A message is written when it comes in. A SIGKILL loses what had not come in; `cg recover
+BAG` makes a bag of the rest. SIGINT and SIGTERM close the bag properly.
+
+in    the sensor and torque topics of `mechanism`, /experiment, and those of `also`
+out   /recorder/progress
 """
 
 import contextlib
@@ -234,7 +237,7 @@ def main(args: list[str] | None = None) -> int:
     # Before anything starts a thread: threads inherit it. An ordinary user may not; so be it.
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-    return run(RecorderNode, args)
+    return run(RecorderNode, RecorderSettings, args)
 
 
 if __name__ == '__main__':

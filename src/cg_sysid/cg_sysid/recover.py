@@ -1,6 +1,6 @@
 """Make an ordinary bag of what a recording left on disk, complete, killed or damaged. No ROS.
 
-`ros2 run cg_sysid recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
+`cg recover BAG` for people, `needs_recovery` and `recover` for programs. Works on
 the journals of this project's recorder, and on any MCAP bag whose writer died or that was damaged
 later: everything intact is kept, before and after the damage, and what was lost is told. The bag
 is complete on disk at every moment: the new file replaces the old one in one step, and
@@ -32,7 +32,6 @@ from cg_sysid.channels import MECHANISMS, NOTE_TOPIC, STRING
 from cg_sysid.journal import STATUS_TOPIC, TYPE_KEY
 from cg_sysid.mcap_records import LATEST_NS, MAGIC
 from cg_sysid.mcap_scan import Gap, Survey, messages, survey
-
 from cg_sysid.progress import Bars
 
 JOURNAL_NAME = 'journal.mcap'
@@ -551,7 +550,7 @@ def _keep(source: Path, copy: Path) -> None:
 def main(args: list[str] | None = None) -> int:
     """Entry point of `cg recover`."""
     parser = argparse.ArgumentParser(
-        prog='recover',
+        prog='cg recover',
         description='Make an ordinary bag of a recording that was cut off or damaged.',
     )
     parser.add_argument('bag', nargs='+', help='bag directory or .mcap file')
@@ -560,15 +559,18 @@ def main(args: list[str] | None = None) -> int:
     )
     status = 0
     options = parser.parse_args(args)
-    for bag in options.bag:
+    for done, bag in enumerate(options.bag):
         try:
-            if Path(bag).exists() and not options.force and not is_damaged(bag):
-                print(f'{bag}: nothing to recover')
-                continue
-            result = recover(bag)
+            with Bars('cg recover') as bars:
+                bars(f'recovering {bag}', done, len(options.bag))
+                sound = Path(bag).exists() and not options.force and not is_damaged(bag)
+                result = None if sound else recover(bag)
         except (RecoveryError, OSError) as error:
             print(f'error: {error}', file=sys.stderr)
             status = 1
+            continue
+        if result is None:
+            print(f'{bag}: nothing to recover')
             continue
         print(f'{result.path}: {result.messages} messages recovered')
         for line in result.remarks:
