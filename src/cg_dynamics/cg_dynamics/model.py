@@ -9,6 +9,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from cg_description.model_file import (
     EffectEntry,
     ModelFile,
@@ -254,7 +256,11 @@ class Model:
         Raises:
             ModelError: if a consistency condition is broken.
         """
-        for index, value in enumerate(self.mechanism.consistency(self.values)):
+        # Numbers that divide by zero to infinity: a condition says of itself that it is broken.
+        with np.errstate(divide='ignore', invalid='ignore'):
+            values = {name: np.float64(value) for name, value in self.values.items()}
+            conditions = self.mechanism.consistency(values)
+        for index, value in enumerate(conditions):
             if not value > 0:
                 raise ModelError(
                     f'{where}: no real bodies have these parameters: condition {index + 1} of '

@@ -212,3 +212,11 @@ def test_consistent_lumps_have_real_bodies(rng):
         assert sum(masses) < 1
         for name, value in c.items():
             np.testing.assert_allclose(again[name], value, atol=1e-12)
+
+
+@pytest.mark.parametrize('lump', ['c1', 'c2'])
+def test_lumps_whose_conditions_divide_by_zero_are_refused_by_name(lump):
+    model = Model.load(model_path('compass_gait_mit'))
+    equal = model.with_values({lump: model.values['c3']})
+    with pytest.raises(ModelError, match='no real bodies have these parameters'):
+        equal.require_consistency()
