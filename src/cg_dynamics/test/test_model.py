@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from cg_description.model_file import sha256
+from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_names, parameter_vector
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms import MECHANISMS
