@@ -185,7 +185,11 @@ def test_too_few_landings_are_not_judged():
 LUMPS = (('c1', 1.12), ('c2', 0.9), ('c4', 0.88), ('c5', 1.1))
 
 
-@pytest.mark.parametrize('ground', [(), BOUNCY, SLIPPERY], ids=['plastic', 'bouncy', 'slippery'])
+@pytest.mark.parametrize(
+    'ground',
+    [(), pytest.param(BOUNCY, marks=pytest.mark.evidence), SLIPPERY],
+    ids=['plastic', 'bouncy', 'slippery'],
+)
 def test_the_ground_is_named_in_a_robot_of_other_numbers(ground):
     records, _ = recorded(ground, LUMPS, (0, 1))
     cut = cut_steps(records, nominal())
@@ -258,7 +262,7 @@ def in_mujoco(values, seed, friction):
                   'compass_gait', Setup(stance=stance))  # fmt: skip
 
 
-@pytest.mark.parametrize('friction', [2.0, 0.35])
+@pytest.mark.parametrize('friction', [pytest.param(2.0, marks=pytest.mark.evidence), 0.35])
 def test_the_ground_of_another_engine_is_named(friction):
     pytest.importorskip('mujoco', reason='MuJoCo is not installed')
     from mujoco_robot import two_links

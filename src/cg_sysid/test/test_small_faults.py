@@ -71,10 +71,10 @@ def test_small_faults_alone_are_consistent(nominal):
 @pytest.mark.parametrize(
     ('effect', 'values'),
     [
-        ('torque_bias', {'bias': 0.3}),
+        pytest.param('torque_bias', {'bias': 0.3}, marks=pytest.mark.evidence),
         ('encoder_offset', {'offset': 0.012}),
         ('actuator_delay', {'delay': 0.008}),
-        ('quadratic_friction', {'coefficient': 0.2}),
+        pytest.param('quadratic_friction', {'coefficient': 0.2}, marks=pytest.mark.evidence),
     ],
 )
 def test_a_cause_is_named_among_small_faults(nominal, effect, values):
@@ -161,7 +161,8 @@ def test_springs_that_do_not_conspire_are_no_tether(nominal):
     [
         ('stribeck_friction', {'torque': 0.9, 'stribeck_rate': 0.3}, ('exponent', 1.0),
          'quadratic_friction'),
-        ('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant'),
+        pytest.param('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant',
+                     marks=pytest.mark.evidence),
         ('position_dependent_friction', {'torque': 3.5, 'tightest': 0.4}, ('cycles', 2.0),
          'asymmetric_friction'),
     ],

@@ -39,6 +39,7 @@ def _session(machines):
     ]  # fmt: skip
 
 
+@pytest.mark.evidence
 def test_grease_that_warms_over_a_session_is_seen(nominal):
     levels = [2.6, 2.3, 2.05, 1.9]
     warm = [nominal.with_values({'coulomb_friction.torque': level}) for level in levels]
