@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from cg_control.friction import compensated
 from cg_control.program import GUESSES, WEAK, Program, Solution
-from cg_control.task import Box, Ellipsoid, Task
+from cg_control.task import Box, Goal, Stretch, Task
 from cg_control.trajectory import Trajectory
 from cg_description.model_file import Quantity
 from cg_dynamics.linearise import without_extra_states
@@ -229,6 +229,9 @@ def optimise(
             f'converge within {options.fine_iterations} iterations',
             spent,
         )
+    joined = {}
+    if isinstance(task.goal, Stretch):
+        joined = dict(zip(('onto', 'elapsed'), task.goal.place(found.slid), strict=True))
     return found.trajectory(
         task.modes,
         model.hash,
@@ -240,10 +243,13 @@ def optimise(
         periodic=task.periodic,
         slope=task.slope,
         iterations=spent,
+        **joined,
     )
 
 
-def _said(ends: Box | Ellipsoid) -> str:
+def _said(ends: Goal) -> str:
+    if isinstance(ends, Stretch):
+        return f'anywhere within {ends.length:.2g} s from node {ends.node[0]} on'
     if isinstance(ends, Box) and not (ends.lower == ends.upper).all():
         return 'a set of states'
     center = ' '.join(f'{value:.3g}' for value in ends.center)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cg_control.task import Box, Ellipsoid, Task
+from cg_control.task import Box, Ellipsoid, Goal, Stretch, Task
 from cg_control.trajectory import Phase, Trajectory
 from cg_control.transcription import (
     KNOT,
     MEMORY_UNITS,
+    PIECES,
     RATE_SCALE,
     UNITS,
     Transcription,
@@ -54,6 +55,7 @@ class Solution:
         durations: Of the phases, s.
         iterations: Of the solver.
         seconds: That it took.
+        slid: How far along the stretch it ends, s, if the goal is one.
     """
 
     converged: bool
@@ -63,6 +65,7 @@ class Solution:
     durations: tuple[float, ...]
     iterations: int
     seconds: float
+    slid: float = 0.0
 
     def trajectory(self, modes: Sequence[str], model_hash: str, **provenance: Any) -> Trajectory:
         """The motion as a trajectory that begins at time zero."""
@@ -110,7 +113,7 @@ class Program:
                 task.reach,
                 task.approach,
             ],
-            _goal_parameters(task.goal),
+            _goal_parameters(task, weak),
         ])  # fmt: skip
         t = self.transcription
         self.lower, self.upper = t.lower.copy(), t.upper.copy()
@@ -143,6 +146,8 @@ class Program:
             lower[at + 6], upper[at + 6] = -self.limit / UNITS[6], self.limit / UNITS[6]
             if k == 0:
                 lower[at + 7], upper[at + 7] = task.durations
+        if isinstance(task.goal, Stretch):
+            lower[-1], upper[-1] = 0.0, task.goal.length
         return lower, upper
 
     def guess(self, guess: Guess) -> Solution:
@@ -166,7 +171,8 @@ class Program:
             knots.append(knot)
         duration = float(np.clip(guess.duration, *task.durations))
         durations = (duration,) * len(knots)
-        return Solution(False, math.inf, math.inf, tuple(knots), durations, 0, 0.0)
+        slid = task.goal.length / 2 if isinstance(task.goal, Stretch) else 0.0
+        return Solution(False, math.inf, math.inf, tuple(knots), durations, 0, 0.0, slid)
 
     def ballistic(self, guess: Guess) -> Solution:
         """As `guess`, but the first phase is a short coasting from the start.
@@ -188,6 +194,8 @@ class Program:
     def running_cost(self, solution: Solution) -> float:
         """What torque and time cost, by the weights of the task."""
         total = 0.0
+        if isinstance(self.task.goal, Stretch):
+            total = _remaining_cost(self.task, solution.slid)
         for knots, duration in zip(solution.knots, solution.durations, strict=True):
             squares = knots[:, 6] ** 2
             mean = (squares[1:] + squares[:-1]).mean() / 2
@@ -207,6 +215,8 @@ class Program:
             elif i < len(self.task.modes) - 1:
                 z[at + nx : at + size - 1] = (start.knots[i + 1][0] / UNITS)[4:]
                 z[at + size - 1] = start.durations[i + 1]
+        if self.transcription.slides:
+            z[-1] = start.slid
         return z
 
     def solve(self, start: Solution, iterations: int, tolerance: float) -> Solution:
@@ -247,10 +257,47 @@ class Program:
             tuple(durations),
             int(stats['iter_count']),
             seconds,
+            float(z[-1]) if self.transcription.slides else 0.0,
         )
 
 
-def _goal_parameters(goal: Box | Ellipsoid) -> np.ndarray:
+def _goal_parameters(task: Task, weight: float) -> np.ndarray:
+    goal: Goal = task.goal
+    if isinstance(goal, Stretch):
+        # Pieces that are not there begin beyond what bounds allow.
+        edges = np.zeros((PIECES, 4, 5))
+        edges[: len(goal.span), :, :4] = goal.edges[:, :, 1:]
+        edges[: len(goal.span), :, 4] = weight * _costs_to_go(task)
+        start = np.full(PIECES, 1e3)
+        start[: len(goal.span)] = np.cumsum(goal.span) - goal.span
+        form = [] if goal.form is None else goal.form.ravel(order='F')
+        return np.concatenate([start, edges.ravel(), form])
     if isinstance(goal, Ellipsoid):
         return np.concatenate([goal.center, np.asarray(goal.form, float).ravel(order='F')])
     return np.clip(np.concatenate([goal.lower, goal.upper]), -1e3, 1e3)
+
+
+def _costs_to_go(task: Task) -> np.ndarray:
+    """Cost from a point of the stretch to its end, as powers of the time since a node: (n, 4)."""
+    goal = task.goal
+    assert isinstance(goal, Stretch)
+    a, b, h = goal.edges[:, 0, 0], goal.edges[:, 1, 0], goal.span
+    # u0 = a + b t; minus the integral of effort u0^2 + time.
+    powers = -np.column_stack([
+        np.zeros(len(h)),
+        task.effort * a**2 + task.time,
+        task.effort * a * b,
+        task.effort * b**2 / 3,
+    ])
+    spent = (powers * h[:, None] ** np.arange(4.0)).sum(axis=1)
+    powers[:, 0] = -np.cumsum(spent[::-1])[::-1]
+    return powers
+
+
+def _remaining_cost(task: Task, s: float) -> float:
+    """What the rest of the stretch costs from s on."""
+    goal = task.goal
+    assert isinstance(goal, Stretch)
+    node, since = goal.place(s)
+    piece = int(np.flatnonzero(goal.node == node)[0])
+    return float(since ** np.arange(4.0) @ _costs_to_go(task)[piece])

@@ -3,11 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cg_control.transcription import Structure
+from cg_control.transcription import PIECES, Structure
 from cg_dynamics.rig import STANCES
+
+if TYPE_CHECKING:
+    from cg_control.nodes import Nodes
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,101 @@ class Ellipsoid:
     form: np.ndarray
 
 
+@dataclass(frozen=True)
+class Stretch:
+    """Any point x0(s) of a stretch of a branch, 0 <= s <= length: a goal that slides.
+
+    The rest of the way along the stretch is part of the cost, with the weights of the task: so
+    the motion joins where that is cheapest, and costs of stretches of one length compare.
+
+    Attributes:
+        stance: Leg that stands.
+        node: Nodes at which its pieces begin, at most PIECES of them, shape (n,).
+        span: Time to the next node, s, shape (n,).
+        edges: (u0, x0) on the way there as powers of the time since the node, shape (n, 4, 5).
+        form: Points with (x - x0(s))' form (x - x0(s)) <= 1 count as well, shape (4, 4),
+            symmetric, positive definite; None: x0(s) itself is met.
+    """
+
+    stance: str
+    node: np.ndarray
+    span: np.ndarray
+    edges: np.ndarray
+    form: np.ndarray | None = None
+
+    def __post_init__(self):
+        n = len(self.node)
+        if not 1 <= n <= PIECES:
+            raise ValueError(f'a stretch has {n} pieces; allowed are 1 to {PIECES}')
+        shapes = {'span': (n,), 'edges': (n, 4, 5)}
+        if self.form is not None:
+            shapes['form'] = (4, 4)
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), float)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f'{name} of a stretch must be finite numbers of shape {shape}')
+            object.__setattr__(self, name, value)
+        if not (self.span > 0).all():
+            raise ValueError('each piece of a stretch must last')
+
+    @classmethod
+    def along(
+        cls, nodes: 'Nodes', first: int, pieces: int = PIECES, form: np.ndarray | None = None
+    ) -> 'Stretch':
+        """The stretch of a tree from a node on, as far as the next impact or the root.
+
+        Args:
+            nodes: The tree.
+            first: Node at which it begins, not beyond a late impact.
+            pieces: At most so many nodes are followed, over links.
+            form: As the attribute.
+
+        Raises:
+            ValueError: if the reference goes nowhere from that node.
+        """
+        found: list[int] = []
+        at = first
+        while len(found) < pieces and not nodes.late[at] and math.isfinite(nodes.span[at]):
+            if nodes.span[at] > 0:
+                if nodes.impact[at]:
+                    break
+                found.append(at)
+            at = int(nodes.next[at])
+        if not found:
+            raise ValueError(
+                f'no stretch begins at node {first}: the robot rests there or lands, '
+                'or its impact is late'
+            )
+        edges = nodes.edges[found][:, :, :5]
+        return cls(STANCES[nodes.stance[first]], np.array(found), nodes.span[found], edges, form)
+
+    @property
+    def length(self) -> float:
+        """In s."""
+        return float(self.span.sum())
+
+    def place(self, s: float) -> tuple[int, float]:
+        """Where x0(s) is: a node, and the time since in s; what `Nodes.grafted` takes."""
+        piece, since = self._piece(s)
+        return int(self.node[piece]), since
+
+    def at(self, s: float) -> np.ndarray:
+        """x0(s), shape (4,)."""
+        piece, since = self._piece(s)
+        return since ** np.arange(4.0) @ self.edges[piece][:, 1:]
+
+    @property
+    def center(self) -> np.ndarray:
+        """Its middle in time."""
+        return self.at(self.length / 2)
+
+    def _piece(self, s: float) -> tuple[int, float]:
+        starts = np.cumsum(self.span) - self.span
+        piece = max(int(np.searchsorted(starts, s, side='right')) - 1, 0)
+        return piece, float(np.clip(s - starts[piece], 0.0, self.span[piece]))
+
+
+Goal = Box | Ellipsoid | Stretch
 UPRIGHT = Box.point(np.zeros(4))
 
 
@@ -97,7 +196,7 @@ class Task:
 
     modes: tuple[str, ...]
     start: Box = UPRIGHT
-    goal: Box | Ellipsoid = UPRIGHT
+    goal: Goal = UPRIGHT
     periodic: bool = False
     torque_limit: float | None = None
     rate_limit: float = math.inf
@@ -116,6 +215,13 @@ class Task:
                 raise ValueError(f'modes: {mode!r} is not one of {", ".join(STANCES)}')
         if self.torque_limit is not None and not self.torque_limit >= 0:
             raise ValueError(f'torque_limit is {self.torque_limit}; it must not be negative')
+        if isinstance(self.goal, Stretch) and self.periodic:
+            raise ValueError('a periodic motion has no stretch to end on')
+        if isinstance(self.goal, Stretch) and self.goal.stance != self.modes[-1]:
+            raise ValueError(
+                f'the goal is a stretch on the {self.goal.stance} leg, the motion ends on the '
+                f'{self.modes[-1]} leg'
+            )
         low, high = self.durations
         if not 0 < low < high:
             raise ValueError(f'durations are {self.durations}; they must be positive, increasing')
@@ -130,6 +236,11 @@ class Task:
             periodic=self.periodic,
             rate_limited=math.isfinite(self.rate_limit),
             clearance=math.isfinite(self.retraction),
-            region=isinstance(self.goal, Ellipsoid),
+            goal=self._kind(),
             elastic=elastic,
         )
+
+    def _kind(self) -> str:
+        if isinstance(self.goal, Stretch):
+            return 'stretch' if self.goal.form is None else 'tube'
+        return 'region' if isinstance(self.goal, Ellipsoid) else 'box'

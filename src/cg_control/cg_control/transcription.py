@@ -52,7 +52,12 @@ TORQUE_SCALE = 100.0  # N m; brings (ID) to the size of the other rows
 RATE_SCALE = 100.0  # N m/s
 CLEARANCE_WIDTH = 0.01  # m of reach over which a retracted foot comes down
 TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
-GOAL_PARAMETERS = {'box': 8, 'region': 20}  # bounds; center and form
+PIECES = 24  # of a stretch
+EDGE = 20  # numbers of a piece: 4 powers of 4 states and of the cost to go
+# Bounds; center and form; instants and edges of the pieces; the same and form.
+GOAL_PARAMETERS = {
+    'box': 8, 'region': 20, 'stretch': PIECES * (1 + EDGE), 'tube': PIECES * (1 + EDGE) + 16
+}  # fmt: skip
 MISS_SCALE = np.array([0.1, 0.1, 0.3, 0.3])  # rad, rad/s: misses of the goal worth the same
 # Long straight-line code: higher levels take minutes to compile it and gain nothing.
 FLAGS_HERE = tuple(flag for flag in FLAGS if flag != '-ftree-vectorize')
@@ -69,7 +74,8 @@ class Structure:
             phases the legs then change places, which makes sense for two equal leg pairs.
         rate_limited: Rows for the rate of the torque.
         clearance: Rows that keep the swing foot above the ground, or its retraction below.
-        region: The goal is an ellipsoid.
+        goal: 'box', 'region' (an ellipsoid), 'stretch' (any point of a branch) or 'tube' (any
+            point of an ellipsoid around one).
         elastic: Goal and landing are no conditions; the cost is how far they are missed. Such a
             program always has a solution, and says whether the strict one has.
     """
@@ -79,7 +85,7 @@ class Structure:
     periodic: bool = False
     rate_limited: bool = False
     clearance: bool = False
-    region: bool = False
+    goal: str = 'box'
     elastic: bool = False
 
     def __post_init__(self):
@@ -91,6 +97,8 @@ class Structure:
                 raise ValueError(f'modes: {before!r} twice in a row; an impact changes the leg')
         if len(self.intervals) != len(self.modes) or not self.modes:
             raise ValueError('modes and intervals must have the same number of entries')
+        if self.goal not in GOAL_PARAMETERS:
+            raise ValueError(f'goal: {self.goal!r} is not one of {", ".join(GOAL_PARAMETERS)}')
         if min(self.intervals) < 2:
             raise ValueError(f'intervals are {self.intervals}; each phase needs at least 2')
 
@@ -229,8 +237,9 @@ class Transcription:
 
     Attributes:
         structure: What it was made for.
-        parameter_count: Length of the parameter vector: model, task, region.
+        parameter_count: Length of the parameter vector: model, task, goal.
         units: Of the state of a stage, shape (nx,); its control is in UNITS.
+        slides: The last stage has one control: how far along a stretch the motion ends, s.
         names: Name of each row of g, '' for the dynamics of stages.
         lower: Bounds of the rows of g; those of inequalities are set by the task.
         upper: As `lower`.
@@ -244,9 +253,14 @@ class Transcription:
         self.nx = KNOT + 1 + self.memory
         self.units = np.concatenate([UNITS, [1.0], MEMORY_UNITS[: self.memory]])
         self.model_parameters = len(parameter_names(model, Setup()))
-        goal = GOAL_PARAMETERS['region' if structure.region else 'box']
+        self.slides = structure.goal in ('stretch', 'tube')
+        goal = GOAL_PARAMETERS[structure.goal]
         self.parameter_count = self.model_parameters + len(TASK_PARAMETERS) + goal
         self._symbols = ca.SX.sym('p', self.parameter_count + 1)
+        # All but what the last block alone needs.
+        self._shared = ca.vertcat(
+            self._symbols[: self.parameter_count - goal], self._symbols[-1]
+        )
         self._model = model
         self._build()
 
@@ -313,7 +327,7 @@ class Transcription:
             rows.append(('clearance', room * 10, 0.0, np.inf))
         effort = h / 2 * (u**2 + u_next**2)
         cost = task['effort'] * effort + task['time'] * h
-        return _block(f'stage_{mode}', scaled, self._symbols, rows, cost)
+        return _block(f'stage_{mode}', scaled, self._shared, rows, cost)
 
     def _start(self, mode: str) -> Block:
         """What the first knot must keep besides: nothing before it does."""
@@ -324,7 +338,7 @@ class Transcription:
         ]
         if self.memory:
             rows.append(('memory', (s[8:] - s[:4]) / MEMORY_UNITS, 0.0, 0.0))
-        return _block(f'start_{mode}', scaled, self._symbols, rows, 0)
+        return _block(f'start_{mode}', scaled, self._shared, rows, 0)
 
     def _landing(self, s: ca.SX, mode: str):
         q, v = ca.SX.sym('q', 2), ca.SX.sym('v', 2)
@@ -359,13 +373,14 @@ class Transcription:
             s[:2], v_plus / UNITS[2:4], scaled[self.nx :], scaled[8 : self.nx]
         )
         rows = [('', gap, 0.0, 0.0), *rows]
-        return _block(f'jump_{mode}', scaled, self._symbols, rows, miss)
+        return _block(f'jump_{mode}', scaled, self._shared, rows, miss)
 
     def _last(self, mode: str) -> Block:
-        scaled = ca.SX.sym('z', self.nx)
-        s = self._physical(scaled)
+        scaled = ca.SX.sym('z', self.nx + self.slides)
+        s = self._physical(scaled[: self.nx])
         rows: list[Row] = []
         miss: Any = 0
+        cost: Any = 0
         self._parameters()
         if self.structure.periodic:
             v_plus, rows, miss = self._landing(s, mode)
@@ -375,9 +390,19 @@ class Transcription:
                 miss += ca.sumsqr((image - s[8:]) / MISS_SCALE)
             else:
                 rows.append(('periodicity', (image - s[8:]) / MEMORY_UNITS, 0.0, 0.0))
-        if self.structure.region:
-            e = s[:4] - self._goal[:4]
-            form = ca.dot(e, ca.mtimes(ca.reshape(self._goal[4:], 4, 4), e))
+        goal = self.structure.goal
+        if goal != 'box':
+            center = self._goal[:4]
+            if self.slides:
+                center, cost = self._slid(scaled[self.nx])
+            e = s[:4] - center
+        if goal == 'stretch':
+            if self.structure.elastic:
+                miss += ca.sumsqr(e / MISS_SCALE)
+            else:
+                rows.append(('meeting', e / UNITS[:4], 0.0, 0.0))
+        elif goal != 'box':
+            form = ca.dot(e, ca.mtimes(ca.reshape(self._goal[-16:], 4, 4), e))
             if self.structure.elastic:
                 miss += ca.fmax(form - 1, 0) ** 2
             else:
@@ -385,7 +410,20 @@ class Transcription:
         elif self.structure.elastic:
             below, above = self._goal[:4] - s[:4], s[:4] - self._goal[4:]
             miss += ca.sumsqr(ca.fmax(ca.fmax(below, above), 0) / MISS_SCALE)
-        return _block(f'last_{mode}', scaled, self._symbols, rows, miss)
+        return _block(f'last_{mode}', scaled, self._symbols, rows, miss + cost)
+
+    def _slid(self, s: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """State and cost to go at s along the stretch: of the last piece that began before."""
+        start = self._goal[:PIECES]
+        edges = ca.reshape(self._goal[PIECES : PIECES * (1 + EDGE)], EDGE, PIECES)
+        since, edge = start[0], edges[:, 0]
+        for k in range(1, PIECES):
+            later = s >= start[k]
+            since = ca.if_else(later, start[k], since)
+            edge = ca.if_else(later, edges[:, k], edge)
+        t = s - since
+        value = ca.mtimes(ca.reshape(edge, 5, 4), ca.vertcat(1, t, t**2, t**3))
+        return value[:4], value[4]
 
     # The program
 
@@ -454,7 +492,8 @@ class Transcription:
             height = fill + own
             Z = ca.reshape(z[column : column + count * width], width, count)
             L = ca.reshape(lam_g[row : row + count * height], height, count)[fill:, :]
-            P = ca.repmat(ca.vertcat(p, run.intervals), 1, count)
+            shared = block.function.size1_in(1) - 1
+            P = ca.repmat(ca.vertcat(p[:shared], run.intervals), 1, count)
             mapped = [
                 fn if count == 1 else fn.map(count)
                 for fn in block.functions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cg_control.collocation import planning_model
-from cg_control.transcription import UNITS, Structure, transcribe
+from cg_control.transcription import EDGE, PIECES, UNITS, Structure, transcribe
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.impact import impact
@@ -15,15 +15,23 @@ CASES = [
     Structure(('inner',), (4,)),
     Structure(('inner', 'outer'), (3, 4), rate_limited=True, clearance=True),
     Structure(('outer', 'inner'), (2, 3), elastic=True),
-    Structure(('inner',), (3,), periodic=True, region=True),
+    Structure(('inner',), (3,), periodic=True, goal='region'),
+    Structure(('outer', 'inner'), (2, 2), goal='tube'),
+    Structure(('inner',), (3,), goal='stretch', elastic=True),
     Structure(('inner',), (3,), periodic=True, elastic=True),
 ]
 
 
 def parameters(model, structure):
     goal = np.zeros(8)
-    if structure.region:
-        goal = np.concatenate([np.full(4, 0.1), np.diag([1.0, 2.0, 3.0, 4.0]).ravel()])
+    form = np.diag([1.0, 2.0, 3.0, 4.0]).ravel()
+    if structure.goal == 'region':
+        goal = np.concatenate([np.full(4, 0.1), form])
+    elif structure.goal != 'box':
+        # Six pieces of 0.2 s, each with an edge of its own.
+        start = np.where(np.arange(PIECES) < 6, 0.2 * np.arange(PIECES), 1e3)
+        edges = np.random.default_rng(1).normal(size=EDGE * PIECES)
+        goal = np.concatenate([start, edges, form if structure.goal == 'tube' else []])
     return np.concatenate([parameter_vector(model, Setup()), TASK, goal])
 
 
