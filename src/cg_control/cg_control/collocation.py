@@ -5,19 +5,35 @@
 A task is solved coarsely first: a few intervals say whether there is a motion at all, and their
 solution starts the fine one. Where a solve from one guess ends in nothing, others follow that
 differ in durations and in the pose at the impact.
+
+Dry friction turns its sign within some 0.01 rad/s, in the middle of an interval, and costs
+collocation its order however fine the mesh. So u is the torque that is left for the motion: what
+friction takes is given back on top of it, by the plan with knots of its own where the hip rate
+changes sign, or by the controller; the limit is that of both together.
 """
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
-from cg_control.friction import compensated
-from cg_control.program import GUESSES, WEAK, Program, Solution
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import brentq
+
+from cg_control.friction import (
+    compensated,
+    friction_parameters,
+    friction_torque,
+    known_beforehand,
+)
+from cg_control.program import GUESSES, SMALLEST_LIMIT, WEAK, Guess, Program, Solution
 from cg_control.task import Box, Goal, Stretch, Task
-from cg_control.trajectory import Trajectory
+from cg_control.trajectory import Phase, Trajectory
 from cg_description.model_file import Quantity
 from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 
+TURNING = 0.03  # rad/s, within which dry friction turns its sign
 SOFT_TRANSITION = 0.2  # rad/s
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 ELASTIC_ITERATIONS = 60
@@ -77,15 +93,20 @@ def _limited(model: Model, joint: str, limit: float) -> Model:
     return replace(model, actuators={**model.actuators, channel: stated})
 
 
-def softened(model: Model) -> Model:
+def softened(model: Model, labels: tuple[str, ...] | None = None) -> Model:
     """The model with dry friction that turns its sign over a wider band of rates.
 
     A few intervals cannot follow a change within 0.01 rad/s, and need not.
+
+    Args:
+        model: Any.
+        labels: Of the effects that are softened; None: all.
     """
+    beginnings = tuple(f'{label}.' for label in labels or ())
     return model.with_values({
         name: max(model.values[name], SOFT_TRANSITION)
         for name, parameter in model.declarations.items()
-        if parameter.smoothing
+        if parameter.smoothing and (labels is None or name.startswith(beginnings))
     })
 
 
@@ -94,10 +115,13 @@ class Options:
     """How a task is solved.
 
     Attributes:
-        coarse: Intervals a phase of the first solve.
+        coarse: Intervals a phase of the first solve; as many as `fine`: there is no second one.
         fine: Intervals a phase of the second.
         guesses: From how many guesses the coarse solve starts, more where those find nothing; the
             cheapest motion is refined.
+        starts: The guesses, in the order in which they are tried.
+        elastic: Where a solve finds nothing, ask the elastic program. Without it a search that
+            finds nothing is cheap and undecided.
         coarse_iterations: Of one coarse solve.
         fine_iterations: Of the fine solve.
         tolerance: Of constraints and optimality, in the units of the scaled rows.
@@ -109,6 +133,8 @@ class Options:
     coarse: int = 8
     fine: int = 20
     guesses: int = 3
+    starts: tuple[Guess, ...] = GUESSES
+    elastic: bool = True
     coarse_iterations: int = 25
     fine_iterations: int = 100
     tolerance: float = 1e-6
@@ -132,7 +158,33 @@ class Screening:
     iterations: int
 
 
-def screen(model: Model, task: Task, options: Options | None = None) -> Screening:
+def given_back(model: Model, task: Task, friction: bool) -> tuple[str, ...]:
+    """Labels of the effects whose torque the motor gives back on top of the planned one.
+
+    Args:
+        model: The robot.
+        task: Its torque limit counts: without torque nothing is given back.
+        friction: False: the controller gives back all joint friction.
+    """
+    limit = model.torque_limit if task.torque_limit is None else task.torque_limit
+    effects = planning_model(model).effects
+    # A command that does not reach the joint as it is leaves dry friction to the dynamics.
+    changed = any(effect.place in ('command', 'transmission') for effect in effects)
+    if limit <= SMALLEST_LIMIT or (friction and changed):
+        return ()
+    return tuple(
+        effect.label
+        for effect in effects
+        if known_beforehand(effect) and (not friction or effect.friction == 'dry')
+    )
+
+
+def screen(
+    model: Model,
+    task: Task,
+    options: Options | None = None,
+    given_back: tuple[str, ...] = (),
+) -> Screening:
     """Is there a motion at all? Coarse solves from several guesses.
 
     Where the solver finds nothing, the elastic program from the same guess brings goal and landing
@@ -143,15 +195,16 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
         model: As planned on (`planning_model`).
         task: What is asked.
         options: How.
+        given_back: As in a `Structure`.
     """
     options = options or Options()
     spent = 0
-    strict = Program(model, task, options.coarse)
+    strict = Program(model, task, options.coarse, False, given_back)
     elastic: Program | None = None
     best: Solution | None = None
     misses: list[float] = []
     cut_short = False
-    for number, guess in enumerate(GUESSES):
+    for number, guess in enumerate(options.starts):
         if best is not None and number >= options.guesses:
             break
         if spent >= options.iterations:
@@ -159,8 +212,8 @@ def screen(model: Model, task: Task, options: Options | None = None) -> Screenin
             break
         found = strict.solve(strict.guess(guess), options.coarse_iterations, options.tolerance)
         spent += found.iterations
-        if not found.converged and best is None:
-            elastic = elastic or Program(model, task, options.coarse, elastic=True)
+        if options.elastic and not found.converged and best is None:
+            elastic = elastic or Program(model, task, options.coarse, True, given_back)
             start = elastic.guess(guess) if number % 2 else elastic.ballistic(guess)
             near = elastic.solve(start, ELASTIC_ITERATIONS, options.tolerance)
             spent += near.iterations
@@ -198,8 +251,10 @@ def optimise(
         UndecidedError: the solver came to no conclusion.
     """
     options = options or Options()
-    planned = planning_model(model, friction)
-    coarse = screen(softened(planned), task, options)
+    returned = given_back(model, task, friction)
+    planned = planning_model(model, friction or bool(returned))
+    soft, exact = softened(planned), softened(planned, returned)
+    coarse = screen(soft, task, options, returned)
     what = f'{" -> ".join(task.modes)} from {_said(task.start)} to {_said(task.goal)}'
     if coarse.verdict == 'infeasible':
         limit = planned.torque_limit if task.torque_limit is None else task.torque_limit
@@ -210,15 +265,18 @@ def optimise(
         )
     if coarse.best is None:
         raise UndecidedError(
-            f'no motion {what} found within {options.guesses} guesses of '
+            f'no motion {what} found within {len(options.starts)} guesses of '
             f'{options.coarse_iterations} iterations or {options.iterations} in all; '
             'there may be one',
             coarse.iterations,
         )
-    fine = Program(planned, task, options.fine)
-    spent = coarse.iterations
-    starts = [coarse.best.resampled(options.fine), *map(fine.guess, GUESSES[: options.guesses])]
-    for start in starts:
+    # Of what is given back only the limit knows, and there a wider band does no harm.
+    fine = Program(exact, task, options.fine, False, returned)
+    spent, found = coarse.iterations, coarse.best
+    guesses = map(fine.guess, options.starts[: options.guesses])
+    starts = [coarse.best.resampled(options.fine), *guesses]
+    same = options.coarse == options.fine and soft.values == exact.values
+    for start in [] if same else starts:
         found = fine.solve(start, options.fine_iterations, options.tolerance)
         spent += found.iterations
         if found.converged or spent >= options.iterations:
@@ -229,10 +287,10 @@ def optimise(
             f'converge within {options.fine_iterations} iterations',
             spent,
         )
-    joined = {}
+    joined: dict[str, Any] = {}
     if isinstance(task.goal, Stretch):
         joined = dict(zip(('onto', 'elapsed'), task.goal.place(found.slid), strict=True))
-    return found.trajectory(
+    motion = found.trajectory(
         task.modes,
         model.hash,
         model=model.name,
@@ -245,6 +303,34 @@ def optimise(
         iterations=spent,
         **joined,
     )
+    if not (friction and returned):
+        return motion
+    return motion.with_phases(tuple(_with_friction(p, planned, fine.limit) for p in motion.phases))
+
+
+def _with_friction(phase: Phase, model: Model, limit: float) -> Phase:
+    """The phase with what dry friction takes on top of its torque, and knots where it turns."""
+    for effect in model.effects:
+        if effect.friction and effect.friction != 'dry':
+            model = model.without_effect(effect.label)
+    taken, p = friction_torque(model), friction_parameters(model)
+    slip = phase.states[:, 2] - phase.states[:, 3]
+    more: list[float] = []
+    for k in np.flatnonzero(slip[:-1] * slip[1:] < 0):
+        first, last = phase.time[k], phase.time[k + 1]
+        turn = brentq(lambda t: float(phase.at(t).state[2:4] @ (1.0, -1.0)), first, last)
+        half = TURNING * (last - first) / abs(slip[k + 1] - slip[k])
+        inside = (last - first) / 1000
+        more += [t for t in (turn - half, turn + half) if first + inside < t < last - inside]
+    time = np.union1d(phase.time, more)
+    cubic = CubicHermiteSpline(phase.time, phase.states, phase.rates)
+    states = cubic(time)
+    torque = np.interp(time, phase.time, phase.torque)
+    angle, rate = states[:, 0] - states[:, 1], states[:, 2] - states[:, 3]
+    torque += np.asarray(taken(angle[None], rate[None], p)).ravel()
+    # A softer friction was kept within the limit.
+    torque = np.clip(torque, -limit, limit)
+    return Phase(phase.stance, time, states, cubic(time, 1), torque)
 
 
 def _said(ends: Goal) -> str:

@@ -47,6 +47,16 @@ def compensated(effect: Effect) -> bool:
     return bool(effect.friction) and effect.place == 'joint'
 
 
+def known_beforehand(effect: Effect) -> bool:
+    """Whether a friction is `compensated` and depends on the joint's angle and rate alone."""
+    if not compensated(effect) or effect.states or effect.extra_inputs:
+        return False
+    angle, rate, load = (ca.SX.sym(name) for name in ('angle', 'rate', 'load'))
+    p = {parameter.name: ca.SX.sym(parameter.name) for parameter in effect.parameters}
+    torque, _ = effect.joint_torque(angle, rate, load, [], p)
+    return not ca.depends_on(torque, load)
+
+
 class FrictionCompensation:
     """(FRIC) for one joint of a model.
 
@@ -90,12 +100,10 @@ def friction_torque(model: Model, joint: str | None = None) -> ca.Function:
     names = parameter_names(model, Setup())
     p = ca.SX.sym('p', len(names))
     by_name = dict(zip(names, ca.vertsplit(p), strict=True))
-    angle, rate, load = (ca.SX.sym(name) for name in ('angle', 'rate', 'load'))
-    torque = ca.SX(0)
+    angle, rate, torque = ca.SX.sym('angle'), ca.SX.sym('rate'), ca.SX(0)
     for effect in acting_effects(model):
-        if compensated(effect) and effect.site == joint:
+        if known_beforehand(effect) and effect.site == joint:
             own = {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
-            added, _ = effect.joint_torque(angle, rate, load, [], own)
-            if not ca.depends_on(added, load):
-                torque = torque - added
+            added, _ = effect.joint_torque(angle, rate, ca.SX(0), [], own)
+            torque = torque - added
     return ca.Function('friction', [angle, rate, p], [torque])

@@ -16,6 +16,7 @@ from cg_control.transcription import (
     MEMORY_UNITS,
     PIECES,
     RATE_SCALE,
+    TORQUE_SCALE,
     UNITS,
     Transcription,
     transcribe,
@@ -95,9 +96,17 @@ class Solution:
 class Program:
     """A task on one grid: bounds, parameters, guesses and answers of a compiled program."""
 
-    def __init__(self, model: Model, task: Task, intervals: int, elastic: bool = False):
+    def __init__(
+        self,
+        model: Model,
+        task: Task,
+        intervals: int,
+        elastic: bool = False,
+        given_back: tuple[str, ...] = (),
+    ):
         self.task, self.intervals = task, intervals
-        self.transcription: Transcription = transcribe(model, task.structure(intervals, elastic))
+        structure = task.structure(intervals, elastic, given_back)
+        self.transcription: Transcription = transcribe(model, structure)
         limit = model.torque_limit if task.torque_limit is None else task.torque_limit
         # Interior-point methods want room: what is next to nothing is nothing.
         self.limit = min(limit, 1e4) if limit > SMALLEST_LIMIT else 0.0
@@ -120,6 +129,9 @@ class Program:
         if 'rate' in t.rows_of:
             limit = task.rate_limit / RATE_SCALE
             self.lower[t.rows_of['rate']], self.upper[t.rows_of['rate']] = -limit, limit
+        if 'motor' in t.rows_of:
+            limit = self.limit / TORQUE_SCALE
+            self.lower[t.rows_of['motor']], self.upper[t.rows_of['motor']] = -limit, limit
         self.x_lower, self.x_upper = self._bounds(elastic)
 
     def _columns(self) -> Iterator[tuple[int, int, int, int]]:
@@ -270,7 +282,7 @@ def _goal_parameters(task: Task, weight: float) -> np.ndarray:
         edges[: len(goal.span), :, 4] = weight * _costs_to_go(task)
         start = np.full(PIECES, 1e3)
         start[: len(goal.span)] = np.cumsum(goal.span) - goal.span
-        form = [] if goal.form is None else goal.form.ravel(order='F')
+        form = np.zeros(0) if goal.form is None else goal.form.ravel(order='F')
         return np.concatenate([start, edges.ravel(), form])
     if isinstance(goal, Ellipsoid):
         return np.concatenate([goal.center, np.asarray(goal.form, float).ravel(order='F')])

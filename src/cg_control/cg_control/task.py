@@ -228,8 +228,10 @@ class Task:
         if not self.rate_limit > 0 or not self.retraction >= 0:
             raise ValueError('rate_limit must be positive and retraction not negative')
 
-    def structure(self, intervals: int, elastic: bool = False) -> Structure:
-        """What has to be compiled for this task."""
+    def structure(
+        self, intervals: int, elastic: bool = False, given_back: tuple[str, ...] = ()
+    ) -> Structure:
+        """What has to be compiled for this task; arguments as the attributes of a structure."""
         return Structure(
             self.modes,
             (intervals,) * len(self.modes),
@@ -238,6 +240,7 @@ class Task:
             clearance=math.isfinite(self.retraction),
             goal=self._kind(),
             elastic=elastic,
+            given_back=given_back,
         )
 
     def _kind(self) -> str:

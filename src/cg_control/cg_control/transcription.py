@@ -32,6 +32,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from cg_control.friction import friction_torque
 from cg_dynamics.assemble import acting_effects, assemble, parameter_names
 from cg_dynamics.c_compiler import FLAGS, compiler, object_file, shared_library
 from cg_dynamics.hybrid import other
@@ -78,6 +79,8 @@ class Structure:
             point of an ellipsoid around one).
         elastic: Goal and landing are no conditions; the cost is how far they are missed. Such a
             program always has a solution, and says whether the strict one has.
+        given_back: Labels of friction effects whose torque the motor gives on top of u: they are
+            no part of the dynamics, and rows keep u and that torque together within the limit.
     """
 
     modes: tuple[str, ...]
@@ -87,6 +90,7 @@ class Structure:
     clearance: bool = False
     goal: str = 'box'
     elastic: bool = False
+    given_back: tuple[str, ...] = ()
 
     def __post_init__(self):
         for mode in self.modes:
@@ -252,7 +256,8 @@ class Transcription:
         self.memory = 4 if structure.periodic else 0
         self.nx = KNOT + 1 + self.memory
         self.units = np.concatenate([UNITS, [1.0], MEMORY_UNITS[: self.memory]])
-        self.model_parameters = len(parameter_names(model, Setup()))
+        self.names_of_model = parameter_names(model, Setup())
+        self.model_parameters = len(self.names_of_model)
         self.slides = structure.goal in ('stretch', 'tube')
         goal = GOAL_PARAMETERS[structure.goal]
         self.parameter_count = self.model_parameters + len(TASK_PARAMETERS) + goal
@@ -261,7 +266,13 @@ class Transcription:
         self._shared = ca.vertcat(
             self._symbols[: self.parameter_count - goal], self._symbols[-1]
         )
-        self._model = model
+        self._model, rubbing = model, model
+        for effect in model.effects:
+            if effect.label in structure.given_back:
+                self._model = self._model.without_effect(effect.label)
+            elif effect.friction:
+                rubbing = rubbing.without_effect(effect.label)
+        self._rubbing = rubbing if structure.given_back else None
         self._build()
 
     # Symbols
@@ -273,6 +284,19 @@ class Transcription:
             zip(TASK_PARAMETERS, ca.vertsplit(task[: len(TASK_PARAMETERS)]), strict=True)
         )
         return self._symbols[: self.model_parameters], named
+
+    def _parameters_of(self, model: Model) -> ca.SX:
+        """The parameters of a model that has some effects less."""
+        at = [self.names_of_model.index(name) for name in parameter_names(model, Setup())]
+        return self._symbols[: self.model_parameters][at]
+
+    def _motor(self, x: ca.SX, u: ca.SX) -> list[Row]:
+        """Rows for the torque of the motor, which gives back friction beside u."""
+        if self._rubbing is None:
+            return []
+        p = self._parameters_of(self._rubbing)
+        taken = friction_torque(self._rubbing)(x[0] - x[1], x[2] - x[3], p)
+        return [('motor', (u + taken) / TORQUE_SCALE, np.nan, np.nan)]
 
     def _physical(self, scaled: Any) -> Any:
         """The state of a stage in SI units."""
@@ -302,8 +326,8 @@ class Transcription:
     def _stage(self, mode: str) -> Block:
         scaled = ca.SX.sym('z', self.nx + KNOT)
         s, w = self._physical(scaled[: self.nx]), ca.DM(UNITS) * scaled[self.nx :]
-        p, task = self._parameters()
-        dynamics = self._inverse_dynamics(mode)
+        _, task = self._parameters()
+        p, dynamics = self._parameters_of(self._model), self._inverse_dynamics(mode)
         x, a, u, T = s[:4], s[4:6], s[6], s[7]
         x_next, a_next, u_next = w[:4], w[4:6], w[6]
         h = T / self._symbols[-1]
@@ -317,6 +341,7 @@ class Transcription:
             ('collocation', dynamics(x_c, a_c, (u + u_next) / 2, p), 0.0, 0.0),
             ('dynamics', dynamics(x_next, a_next, u_next, p), 0.0, 0.0),
         ]
+        rows += self._motor(x_next, u_next)
         if self.structure.rate_limited:
             rows.append(('rate', (u_next - u) / h / RATE_SCALE, np.nan, np.nan))
         if self.structure.clearance:
@@ -332,10 +357,11 @@ class Transcription:
     def _start(self, mode: str) -> Block:
         """What the first knot must keep besides: nothing before it does."""
         scaled = ca.SX.sym('z', self.nx)
-        s, (p, _) = self._physical(scaled), self._parameters()
+        s, p = self._physical(scaled), self._parameters_of(self._model)
         rows: list[Row] = [
             ('dynamics', self._inverse_dynamics(mode)(s[:4], s[4:6], s[6], p), 0.0, 0.0)
         ]
+        rows += self._motor(s[:4], s[6])
         if self.memory:
             rows.append(('memory', (s[8:] - s[:4]) / MEMORY_UNITS, 0.0, 0.0))
         return _block(f'start_{mode}', scaled, self._shared, rows, 0)
@@ -354,7 +380,8 @@ class Transcription:
             (_, height, *_), (_, approach, *_), (_, reach, *_) = rows
             miss = height**2 + ca.fmin(approach, 0) ** 2 + 100 * ca.fmin(reach, 0) ** 2
             rows = []
-        v_plus = impact_function(self._model, mode)(s[:2], s[2:4], self._parameters()[0])[0]
+        p = self._parameters_of(self._model)
+        v_plus = impact_function(self._model, mode)(s[:2], s[2:4], p)[0]
         return v_plus, rows, miss
 
     def _jump(self, mode: str) -> Block:
@@ -362,12 +389,13 @@ class Transcription:
         scaled = ca.SX.sym('z', self.nx + 4)
         s = self._physical(scaled[: self.nx])
         w = ca.DM([*UNITS[4:], 1.0]) * scaled[self.nx :]
-        p, _ = self._parameters()
+        p = self._parameters_of(self._model)
         v_plus, rows, miss = self._landing(s, mode)
         after = self._inverse_dynamics(other(mode))(
             ca.vertcat(s[:2], v_plus), w[:2], w[2], p
         )
         rows.append(('dynamics', after, 0.0, 0.0))
+        rows += self._motor(ca.vertcat(s[:2], v_plus), w[2])
         # The next state enters linearly; the rows of the gap come first and hold it back.
         gap = ca.vertcat(
             s[:2], v_plus / UNITS[2:4], scaled[self.nx :], scaled[8 : self.nx]

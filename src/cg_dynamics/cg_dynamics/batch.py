@@ -99,6 +99,7 @@ def simulate_batch(
     trajectories: bool = False,
     feedback: Feedback | None = None,
     threads: int = 1,
+    largest_step: float | None = None,
 ) -> np.ndarray:
     """States of many rollouts: at the last row (B, nx), or at all rows (B, n, nx).
 
@@ -114,6 +115,8 @@ def simulate_batch(
         trajectories: Return all rows.
         feedback: Closes the loop, with the true state.
         threads: Share the rollouts among so many threads.
+        largest_step: Of the integration, s; None takes the model's. Longer ones are for rough
+            answers.
     """
     compiled = compile_model(model, setup)
     time = np.ascontiguousarray(time, float)
@@ -135,7 +138,7 @@ def simulate_batch(
     shape = (batch, n, compiled.nx) if trajectories else (batch, compiled.nx)
     states = np.empty(shape)
     # C sees addresses only: every array must be held by a name until it returns.
-    rows = np.diff(time)
+    rows, longest = np.diff(time), largest_step or compiled.largest_step
     pointers: list[np.ndarray | None] = [None] * 3
     if feedback is not None:
         pointers = [
@@ -145,7 +148,7 @@ def simulate_batch(
 
     def run(first: int, last: int) -> None:
         library.cgb_simulate(
-            first, last, n, _pointer(rows), compiled.largest_step, _pointer(u), u_each,
+            first, last, n, _pointer(rows), longest, _pointer(u), u_each,
             _pointer(x0), _pointer(p), p_each, *map(_pointer, pointers), trajectories,
             _pointer(states),
         )  # fmt: skip
