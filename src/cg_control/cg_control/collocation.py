@@ -34,6 +34,7 @@ from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 
 TURNING = 0.03  # rad/s, within which dry friction turns its sign
+SLOW, FINER = 0.1, 10  # rad/s below which an interval gets so many times the knots
 SOFT_TRANSITION = 0.2  # rad/s
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 ELASTIC_ITERATIONS = 60
@@ -314,19 +315,28 @@ def _with_friction(phase: Phase, model: Model, limit: float) -> Phase:
         if effect.friction and effect.friction != 'dry':
             model = model.without_effect(effect.label)
     taken, p = friction_torque(model), friction_parameters(model)
-    slip = phase.states[:, 2] - phase.states[:, 3]
-    more: list[float] = []
-    for k in np.flatnonzero(slip[:-1] * slip[1:] < 0):
-        first, last = phase.time[k], phase.time[k + 1]
-        turn = brentq(lambda t: float(phase.at(t).state[2:4] @ (1.0, -1.0)), first, last)
-        half = TURNING * (last - first) / abs(slip[k + 1] - slip[k])
-        inside = (last - first) / 1000
-        more += [t for t in (turn - half, turn + half) if first + inside < t < last - inside]
-    time = np.union1d(phase.time, more)
     cubic = CubicHermiteSpline(phase.time, phase.states, phase.rates)
+
+    def slip(t):
+        states = cubic(t)
+        return states[..., 2] - states[..., 3]
+
+    # Where the hip is slow, friction changes within an interval.
+    slow = np.abs(slip(phase.time)) < SLOW
+    time = np.union1d(phase.time, [
+        np.linspace(phase.time[k], phase.time[k + 1], FINER + 1)[1:-1]
+        for k in np.flatnonzero(slow[:-1] | slow[1:])
+    ])  # fmt: skip
+    rate, more = slip(time), []
+    for k in np.flatnonzero(rate[:-1] * rate[1:] < 0):
+        first, last = time[k], time[k + 1]
+        half = TURNING * (last - first) / abs(rate[k + 1] - rate[k])
+        inside, turn = (last - first) / 1000, brentq(slip, first, last)
+        more += [t for t in (turn - half, turn + half) if first + inside < t < last - inside]
+    time = np.union1d(time, more)
     states = cubic(time)
     torque = np.interp(time, phase.time, phase.torque)
-    angle, rate = states[:, 0] - states[:, 1], states[:, 2] - states[:, 3]
+    angle, rate = states[:, 0] - states[:, 1], slip(time)
     torque += np.asarray(taken(angle[None], rate[None], p)).ravel()
     # A softer friction was kept within the limit.
     torque = np.clip(torque, -limit, limit)

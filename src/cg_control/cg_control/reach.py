@@ -25,7 +25,7 @@ import numpy as np
 from cg_control.basin import modes_of
 from cg_control.collocation import Options
 from cg_control.linearise import linearise_stance
-from cg_control.program import GUESSES, Guess
+from cg_control.program import GUESSES
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import simulate_batch
 from cg_dynamics.impact import impact_function, other
@@ -36,12 +36,10 @@ STEP, DURATION = 0.025, 0.8  # s, of the torques that are tried
 SWITCHES = (0.025, 0.075, 0.125, 0.175, 0.225, 0.3, 0.4, 0.5)  # s, of the first
 BETWEEN = (0.075, 0.15, 0.3)  # s, from the first to the second
 FALLEN = 0.9  # rad
-SOON = 0.5  # zeta from which a step is guessed to be taken at once
 SHORTER = 0.5  # a landing counts from this share of the least step on: few torques are tried
 SWUNG = 1.2  # rad: amplitude of the swing leg from which it is brought back
 # Levels of zeta: at the start, at best under torque, after a landing, before more steps.
-HELD, CAUGHT, LANDED, AHEAD = 1.2, 0.4, 4.5, -1.5
-LATER = 6.0  # in place of LANDED where zeta is below HELD: there is time for other torques
+HELD, CAUGHT, LANDED, AHEAD = 1.2, 0.35, 4.5, -1.5
 
 
 @dataclass(frozen=True)
@@ -68,9 +66,7 @@ class Reach:
         if steps == 0:
             return kept
         # A robot that can be kept up has time for any step.
-        if steps == 1:
-            return kept | (self.landing <= np.where(self.zeta > HELD, LANDED, LATER))
-        return kept | (self.ahead >= AHEAD)
+        return kept | (self.landing <= LANDED if steps == 1 else self.ahead >= AHEAD)
 
 
 class Screen:
@@ -173,24 +169,22 @@ def profiles() -> np.ndarray:
     return np.array(found)
 
 
-def cheap(steps: int, zeta: float, fine: int = 20) -> Options:
+def cheap(steps: int, fine: int = 20) -> Options:
     """Options of a plan that is tried for one state of many: what is not found soon is left.
 
-    A robot that falls already has to step soon, and the guess that says so comes first. Without
-    a step the fine program is solved at once: most of what `Reach` allows is there.
+    One guess, and no elastic program: of the fixed guesses the one that found most motions in the
+    censuses. Without a step there is time, and the fine program is solved at once: most of what
+    `Reach` allows is there. A robot that needs a step falls already.
 
     Args:
         steps: Of the motion.
-        zeta: (CAPTURE) of its start.
         fine: Intervals a phase.
     """
-    slow, soon = GUESSES[0], GUESSES[3]
-    if steps == 0:
+    if steps:
         return Options(
-            coarse=fine, fine=fine, guesses=1, coarse_iterations=40, starts=(slow,), elastic=False
+            fine=fine, guesses=1, coarse_iterations=26, starts=(GUESSES[3],), elastic=False
         )
-    if zeta > HELD:
-        starts: tuple[Guess, ...] = (soon,)
-    else:
-        starts = (soon, slow) if zeta > SOON else (slow, soon)
-    return Options(fine=fine, guesses=1, coarse_iterations=28, starts=starts, elastic=False)
+    return Options(
+        coarse=fine, fine=fine, guesses=1, coarse_iterations=30, starts=(GUESSES[2],),
+        elastic=False,
+    )  # fmt: skip

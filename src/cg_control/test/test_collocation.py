@@ -9,12 +9,17 @@ import pytest
 from cg_control.collocation import (
     InfeasibleError,
     Options,
+    PlanningError,
     UndecidedError,
     optimise,
     planning_model,
     screen,
+    softened,
 )
-from cg_control.task import Box, Ellipsoid, Task
+from cg_control.friction import FrictionCompensation
+from cg_control.nodes import Nodes
+from cg_control.task import Box, Ellipsoid, Stretch, Task
+from cg_control.tvlqr import stabilise
 from cg_dynamics.gait import find_gait
 from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact
@@ -45,9 +50,9 @@ def test_one_step_rebalance_is_a_motion_of_the_exact_model(robot, modes, frictio
     done = played(trajectory, planning_model(robot, friction))
     assert [event.kind for event in done.events] == ['impact']
     assert done.stance == modes[1]
-    # The upright robot amplifies by exp(3.2 * 1 s) what collocation errs at 20 knots a phase;
-    # dry friction, which turns its sign within 0.01 rad/s, costs collocation its order.
-    tolerance = 0.02 if friction else 2e-4
+    # The upright robot amplifies by exp(3.2 * 1 s) what collocation errs at 20 knots a phase, and
+    # that the torque is held while dry friction turns its sign.
+    tolerance = 2e-3 if friction else 2e-4
     assert abs(done.impacts[0].time - trajectory.impact_times[0]) < tolerance
     np.testing.assert_allclose(done.state, trajectory.states[-1], atol=tolerance)
 
@@ -191,3 +196,119 @@ def test_gait_on_flat_ground_repeats_itself(robot):
     assert len(done.impacts) <= 1
     after = impact(walker, 'inner', found.states[-1]).x_plus
     np.testing.assert_allclose(after[[1, 0, 3, 2]], found.states[0], atol=1e-5)
+
+
+@pytest.fixture(scope='module')
+def branch(robot):
+    """The tree of one rebalance from the inner leg to the outer one."""
+    return Nodes.of(stabilise(optimise(robot, REBALANCE, friction=False), robot), robot)
+
+
+def test_a_stretch_is_the_branch_it_is_cut_from(branch):
+    stretch = Stretch.along(branch, branch.first)
+    assert stretch.stance == 'inner'
+    # As far as the impact, and no further.
+    assert branch.impact[branch.next[stretch.node[-1]]]
+    for s in np.linspace(0.0, stretch.length, 7):
+        node, since = stretch.place(s)
+        expected = since ** np.arange(4.0) @ branch.edges[node][:, 1:5]
+        np.testing.assert_array_equal(stretch.at(s), expected)
+    part = Stretch.along(branch, branch.first + 2, pieces=3)
+    assert part.node.tolist() == [branch.first + k for k in (2, 3, 4)]
+    np.testing.assert_allclose(part.at(0.0), branch.x0[branch.first + 2])
+    with pytest.raises(ValueError, match='no stretch begins at node 0'):
+        Stretch.along(branch, 0)
+    with pytest.raises(ValueError, match='stretch on the inner leg'):
+        Task(('outer',), goal=stretch)
+
+
+def test_a_motion_ends_where_joining_the_branch_is_cheapest(robot, branch):
+    """No node is as cheap to end in, and the way on is counted with the weights of the task."""
+    stretch = Stretch.along(branch, branch.first, pieces=12)
+    start = Box.point([0.01, -0.05, 0.05, 0.3])
+    found = optimise(robot, Task(('inner',), start, stretch), friction=False)
+    onto, since = found.provenance['onto'], found.provenance['elapsed']
+    np.testing.assert_allclose(
+        found.states[-1], since ** np.arange(4.0) @ branch.edges[onto][:, 1:5], atol=1e-6
+    )
+    sum_to_go = 0.0
+    for k in range(len(stretch.node) - 1, -1, -1):
+        node = stretch.node[k]
+        # Torque is linear, so its square is what Simpson's rule integrates.
+        u0, u1 = branch.u0[node], branch.u0[branch.next[node]]
+        squares = (u0**2 + (u0 + u1) ** 2 + u1**2) / 6
+        sum_to_go += (0.01 * squares + 0.1) * branch.span[node]
+        if k % 4 == 0:
+            there = Task(('inner',), start, Box.point(branch.x0[node]))
+            try:
+                fixed = optimise(robot, there, friction=False)
+            except PlanningError:
+                continue
+            assert found.provenance['cost'] <= fixed.provenance['cost'] + sum_to_go + 1e-3
+    grown = branch.grafted(
+        stabilise(found, robot, final_cost=branch.S[onto]), robot, onto, since
+    )
+    assert grown.to_go[grown.first] > 0
+    last = np.flatnonzero(grown.branch == 2)[-1]
+    np.testing.assert_allclose(grown.x0[grown.next[last]], found.states[-1], atol=1e-6)
+
+
+def test_a_motion_may_end_near_a_branch(robot, branch):
+    form = np.diag([1 / 0.02**2, 1 / 0.05**2, 1 / 0.1**2, 1 / 0.3**2])
+    start = Box.point([0.01, -0.05, 0.05, 0.3])
+    exact, near = (
+        optimise(
+            robot, Task(('inner',), start, Stretch.along(branch, branch.first, 12, tolerance)),
+            friction=False,
+        )
+        for tolerance in (None, form)
+    )  # fmt: skip
+    onto, since = near.provenance['onto'], near.provenance['elapsed']
+    missed = near.states[-1] - since ** np.arange(4.0) @ branch.edges[onto][:, 1:5]
+    assert 1e-3 < missed @ form @ missed <= 1 + 1e-5
+    assert near.provenance['cost'] < exact.provenance['cost']
+
+
+@pytest.mark.parametrize('steps', [2, 3, 4])
+def test_several_steps_end_on_a_branch_of_either_leg(robot, branch, steps):
+    """Walking on, from where a planned rebalance stands, until a foot meets the branch."""
+    legs = tuple(('outer', 'inner')[k % 2] for k in range(steps + 1))
+    at = branch.first if legs[-1] == 'inner' else int(branch.landing[branch.first])
+    goal = Stretch.along(branch, at)
+    found = optimise(
+        robot, Task(legs, Box.point(np.zeros(4)), goal), Options(fine=8, coarse=8),
+        friction=False,
+    )  # fmt: skip
+    assert found.modes == legs
+    onto, since = found.provenance['onto'], found.provenance['elapsed']
+    assert onto in goal.node
+    end = since ** np.arange(4.0) @ branch.edges[onto][:, 1:5]
+    np.testing.assert_allclose(found.states[-1], end, atol=1e-6)
+    for before, after in itertools.pairwise(found.phases):
+        landed = impact(planning_model(robot, False), before.stance, before.states[-1]).x_plus
+        np.testing.assert_allclose(after.states[0], landed, atol=1e-5)
+
+
+def test_what_dry_friction_takes_is_given_back_within_the_limit(robot):
+    """The plan's torque has friction on top, with knots of its own where the hip turns."""
+    limit = 12.0
+    task = Task(('inner', 'outer'), reach=0.2, torque_limit=limit)
+    with_friction, without = (optimise(robot, task, friction=on) for on in (True, False))
+    taken = FrictionCompensation(softened(planning_model(robot)))
+    for phase in without.phases:
+        slip = phase.states[:, 2] - phase.states[:, 3]
+        whole = phase.torque + [taken.taken(rate) for rate in slip]
+        assert np.abs(whole).max() <= limit + 1e-3
+    assert np.abs(with_friction.torque).max() <= limit + 1e-9
+    phase = optimise(robot, REBALANCE).phases[0]
+    assert len(phase.time) > 21
+    slip = phase.states[:, 2] - phase.states[:, 3]
+    turns = np.flatnonzero(slip[:-1] * slip[1:] < 0)
+    assert len(turns)
+    for k in turns:
+        # 1.84 N m, from one side to the other, between the knots where it is slow.
+        sense = np.sign(slip[k + 1])
+        before = np.flatnonzero(sense * slip[: k + 1] < -0.025)[-1]
+        after = k + 1 + np.flatnonzero(sense * slip[k + 1 :] > 0.025)[0]
+        jump = sense * (phase.torque[after] - phase.torque[before])
+        assert jump == pytest.approx(2 * 1.84, abs=0.4)

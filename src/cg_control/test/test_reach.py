@@ -84,7 +84,7 @@ def test_no_plan_is_found_where_the_screen_says_no(plant, screen):
         tried += 1
         for steps, modes in enumerate([(stance,), (stance, other(stance))]):
             allowed = bool(said.allows(steps)[0])
-            options = cheap(steps, float(said.zeta[0])) if allowed else Options(guesses=1)
+            options = cheap(steps) if allowed else Options(guesses=1)
             try:
                 optimise(plant, Task(modes, Box.point(x)), options)
                 found = True
