@@ -80,7 +80,7 @@ def feasible(task: Task, rng: np.random.Generator, far: bool) -> bool:
                 return True
             near = elastic.solve(start, ELASTIC_ITERATIONS, 1e-6)
             miss = math.sqrt(max(near.cost - WEAK * elastic.running_cost(near), 0.0))
-            if miss < MISSED or not near.converged:
+            if near.converged and miss < MISSED:
                 found = coarse.solve(near, 60, 1e-6)
         if not found.converged and number < 2:
             found = fine.solve(fine.guess(guess), 60, 1e-6)

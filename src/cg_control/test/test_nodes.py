@@ -151,7 +151,7 @@ def test_what_does_not_fit_is_refused(robot, step, back):
         ('stance', 5, 2, 'node 5: stance must be 0 to 1'),
         ('next', 5, 10_000, 'node 5: next must be -1 to'),
         ('next', 5, -1, 'node 5: span must be infinite where next is -1'),
-        ('next', 5, 60, 'node 5: next must be on the same leg'),
+        ('next', 5, 0, 'node 5: next must be on the same leg'),
         ('landing', 5, -2, 'node 5: landing must be -1 to'),
         ('landing', 5, 6, 'node 5: landing must be on the other leg'),
         ('span', 5, -0.1, 'node 5: span must be infinite where'),
