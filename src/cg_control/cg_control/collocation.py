@@ -34,7 +34,7 @@ from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 
 TURNING = 0.03  # rad/s, within which dry friction turns its sign
-SLOW, FINER = 0.1, 10  # rad/s below which an interval gets so many times the knots
+SLOW, FINER = 0.1, 5  # rad/s below which an interval gets so many times the knots
 SOFT_TRANSITION = 0.2  # rad/s
 MISSED = 0.01  # of the scaled miss: 1 mrad or 3 mrad/s, several times what the weak cost leaves
 ELASTIC_ITERATIONS = 60

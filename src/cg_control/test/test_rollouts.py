@@ -69,8 +69,8 @@ def test_two_steps_are_those_of_walk_and_tracker(robot, tree, remedy, slope):
     settings, options = TrackingSettings(remedy=remedy), replace(OPTIONS, slope=slope)
     start = np.array([tree.first, tree.first + 7, tree.landing[tree.first]])
     x = drawn(tree, start, seed=3, share=0.3)
-    found = follow(tree, robot, start, x, 3.0, settings=settings, options=options)
-    done = walked(tree, robot, start, x, 3.0, settings, options)
+    found = follow(tree, robot, start, x, 3.5, settings=settings, options=options)
+    done = walked(tree, robot, start, x, 3.5, settings, options)
     assert_same(found, done)
     assert found.impacts.max() == 2
     planned = tree.time[tree.landing[tree.first]]
@@ -161,9 +161,10 @@ def test_from_every_node_the_nominal_state_comes_home(robot, tree):
     start = np.flatnonzero(~tree.late & ~tree.impact)
     found = follow(tree, robot, start, tree.x0[start], tree.to_go[start] + 1.5, goal=GOAL)
     assert (found.outcome == Outcome.ARRIVED).all()
-    # The second trajectory begins in the goal region, upright on the goal's leg.
+    # Trajectories begin or end in the goal region, upright on the goal's leg, where the hip is
+    # slow and knots are close.
     moved = found.time > 0
-    assert (~moved).sum() < 12
+    assert 0.5 < moved.mean() < 1
     np.testing.assert_array_equal(found.impacts[moved], tree.steps[start][moved])
     inside = np.einsum('bi,ij,bj->b', found.state, GOAL[1], found.state)
     assert inside.max() <= 1
@@ -213,7 +214,7 @@ def test_results_do_not_depend_on_company(robot, tree, threads):
 def test_visits_say_at_which_cost_each_node_was_passed(robot, tree):
     start = np.array([tree.first])
     x = drawn(tree, start, seed=12, share=0.1)
-    found = follow(tree, robot, start, x, 5.0, visits=150)
+    found = follow(tree, robot, start, x, 5.0, visits=400)
     nodes = found.visits.node[0]
     nodes = nodes[nodes >= 0]
     # All of the way, the link included, but what an early landing skips.
