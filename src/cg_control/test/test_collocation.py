@@ -297,7 +297,8 @@ def test_what_dry_friction_takes_is_given_back_within_the_limit(robot):
     taken = FrictionCompensation(softened(planning_model(robot)))
     for phase in without.phases:
         slip = phase.states[:, 2] - phase.states[:, 3]
-        whole = phase.torque + [taken.taken(rate) for rate in slip]
+        hip = phase.states[:, 0] - phase.states[:, 1]
+        whole = phase.torque + [taken.taken(*point) for point in zip(hip, slip, strict=True)]
         assert np.abs(whole).max() <= limit + 1e-3
     assert np.abs(with_friction.torque).max() <= limit + 1e-9
     phase = optimise(robot, REBALANCE).phases[0]

@@ -63,7 +63,7 @@ def test_time_and_steps_to_go_add_up(tree, step, back):
         node = int(tree.planned[node])
         seen.append(node)
     assert node == 0
-    assert (np.diff(tree.to_go[seen]) <= 0).all()
+    assert (np.diff(tree.to_go[seen]) <= 1e-12).all()  # rounding of sums of seconds
     assert len(seen) == len(step.time) + len(back.time) + 1
 
 
