@@ -5,6 +5,7 @@ looks now and then whether the answer is there. Neither starts anything or waits
 holds one question at a time: of those asked meanwhile only the last one is put to it.
 """
 
+import contextlib
 import json
 import os
 import subprocess
@@ -72,11 +73,9 @@ class BasinSampler:
 
     def _send(self, line: bytes) -> None:
         self._asked, self._next = True, None
-        try:
+        with contextlib.suppress(OSError):  # it has died; `collect` says so
             self._questions.write(line)
             self._questions.flush()
-        except OSError:  # it has died; `collect` says so
-            pass
 
     def collect(self) -> dict[str, Basin] | None:
         """The basins asked for last, once; None while there is nothing new.
@@ -117,7 +116,8 @@ class BasinSampler:
         """End the process."""
         self._process.kill()
         self._process.wait()
-        self._questions.close()
+        with contextlib.suppress(OSError):  # what it did not read any more
+            self._questions.close()
         self._answers.close()
 
 
