@@ -201,14 +201,15 @@ def save(model: ModelFile, path: str | Path) -> None:
     write_atomically(path, dump(model))
 
 
-def write_atomically(path: str | Path, text: str) -> None:
-    """Write text to path through a temporary file in the same directory."""
+def write_atomically(path: str | Path, text: str | bytes) -> None:
+    """Write text (as UTF-8) or bytes to path through a temporary file in the same directory."""
     path = Path(path)
+    content = text.encode() if isinstance(text, str) else text
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
     try:
-        with os.fdopen(handle, 'w', encoding='utf-8') as file:
-            file.write(text)
+        with os.fdopen(handle, 'wb') as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         # mkstemp makes the file private; a model or report is as readable as its neighbours.

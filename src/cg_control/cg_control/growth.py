@@ -1,0 +1,299 @@
+"""Growing a tree by falsification: docs/trees.md, "Growth".
+
+    1. Draw a state. The tree claims it if it lies in the funnel of a node, rho >= cost.
+    2. A claim is simulated, from the node at which the state is least deep. If the robot comes
+       home, the state is covered.
+    3. If it does not, the claim was false, and so were those of all nodes that the robot came by
+       in vain: their levels are cut (levels.py), and the state is looked up again.
+    4. A state that nobody claims is planned for. The motion found ends anywhere on the tree, and
+       its nodes join it with funnels that are infinite until they are cut.
+
+After Reist, Preiswerk and Tedrake 2016 (simulation-based LQR-trees), with hybrid motions as in the
+thesis, 4.6. New funnels are also tried with states drawn around their nodes: an infinite funnel
+would draw every later sample to itself until it is cut.
+
+States are drawn and simulated a round at a time, and a round is the same whoever computes it: a
+tree depends on its seed, not on the number of workers, nor on being interrupted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cg_control.levels import Levels
+from cg_control.lookup import Lookup
+from cg_control.nodes import Nodes
+from cg_control.rollouts import Outcome, Rollouts, follow
+from cg_control.tracking import TrackingSettings
+from cg_control.trajectory import Trajectory
+from cg_control.tree import Tree
+from cg_dynamics.hybrid import WalkOptions
+from cg_dynamics.model import Model
+
+MOST_CLAIMS = 40  # false claims of one sample in one round, after which it counts as unclaimed
+MOST_LANDINGS = 6  # of a robot whose foot lands where no impact is planned
+PROBE_SHELLS = 8
+AT_HOME = 3.0  # s that the balance controller may take beyond the end of the motion
+VISITS = 512  # nodes that a rollout may come by
+
+
+@dataclass(frozen=True)
+class Region:
+    """The states that are drawn: a box in the roles of the legs, one for both stance legs.
+
+    Attributes:
+        lower: (stance angle, swing angle) and rates, in rad and rad/s, shape (nx,).
+        upper: As `lower`.
+        legs: How many legs can stand.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    legs: int = 2
+
+    def draw(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Stance legs (count,) and states (count, nx), in the order of the coordinates."""
+        leg = rng.integers(0, self.legs, count)
+        x = rng.uniform(self.lower, self.upper, (count, len(self.lower)))
+        return leg, in_coordinates(leg, x)
+
+
+def in_coordinates(leg: np.ndarray, roles: np.ndarray) -> np.ndarray:
+    """(q_inner, q_outer) and rates of states in (stance, swing) and rates; its own inverse."""
+    if roles.shape[-1] != 4:
+        return roles
+    return np.where((np.asarray(leg) == 1)[..., None], roles[..., [1, 0, 3, 2]], roles)
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A motion that ends on the tree.
+
+    Attributes:
+        trajectory: With gains, and the cost to go of the tree at its end.
+        onto: Node at which it ends,
+        elapsed: or so much later, s.
+    """
+
+    trajectory: Trajectory
+    onto: int
+    elapsed: float = 0.0
+
+
+@dataclass(frozen=True)
+class GrowthOptions:
+    """How a tree is grown.
+
+    Attributes:
+        seed: Of everything that is drawn.
+        round_size: States drawn at a time.
+        at_once: States planned for before the others of a round are looked up again.
+        probes: States drawn around each node of a new branch.
+        probe_costs: Least and largest cost at which they are drawn.
+        tolerated: Share of failures that a funnel may hold (levels.py).
+    """
+
+    seed: int = 0
+    round_size: int = 512
+    at_once: int = 8
+    probes: int = 16
+    probe_costs: tuple[float, float] = (1e-2, 1e2)
+    tolerated: float = 0.01
+
+
+@dataclass
+class Counts:
+    """What growing came to so far. All are sums over states."""
+
+    samples: int = 0
+    covered: int = 0
+    false_claims: int = 0
+    unclaimed: int = 0
+    planned: int = 0
+    grown: int = 0
+    rejected: int = 0
+    rollouts: int = 0
+
+
+Extend = Callable[[Nodes, np.ndarray, np.ndarray], Sequence[Branch | None]]
+
+
+@dataclass
+class Grower:
+    """A tree while it grows.
+
+    Attributes:
+        model: The robot.
+        tree: So far.
+        region: Where states are drawn.
+        extend: (nodes, legs (n,), states (n, nx)) -> a branch for each state or None.
+        options: How.
+        settings: The law that follows the tree.
+        simulation: Options of the rollouts.
+        threads: Of the rollouts; the tree is the same with any number.
+        counts: So far.
+        rounds: Finished.
+    """
+
+    model: Model
+    tree: Tree
+    region: Region
+    extend: Extend
+    options: GrowthOptions = field(default_factory=GrowthOptions)
+    settings: TrackingSettings = field(default_factory=TrackingSettings)
+    simulation: WalkOptions | None = None
+    threads: int = 1
+    counts: Counts = field(default_factory=Counts)
+    rounds: int = 0
+
+    def __post_init__(self):
+        self.levels = Levels(self.options.tolerated).extended(len(self.tree.nodes))
+        self._lookup = Lookup(self.tree.nodes)
+        self._first = 0
+
+    @property
+    def nodes(self) -> Nodes:
+        """Of the tree so far."""
+        return self.tree.nodes
+
+    def round(self) -> Counts:
+        """Draw a round of states, and do what each calls for; returns the counts of this round."""
+        before = replace(self.counts)
+        rng = np.random.default_rng([self.options.seed, self.rounds])
+        leg, x = self.region.draw(rng, self.options.round_size)
+        open_ = self.look_up(leg, x)
+        self.counts.samples += len(leg)
+        self.counts.unclaimed += len(open_)
+        while len(open_):
+            now, open_ = open_[: self.options.at_once], open_[self.options.at_once :]
+            grown = self._plan_for(leg[now], x[now], rng)
+            if grown and len(open_):
+                open_ = open_[self.look_up(leg[open_], x[open_])]
+        self.rounds += 1
+        return Counts(**{k: v - getattr(before, k) for k, v in vars(self.counts).items()})
+
+    def look_up(self, leg: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Simulate what is claimed, cut what was claimed falsely; rows that nobody claims."""
+        open_ = np.arange(len(leg))
+        unclaimed: list[np.ndarray] = []
+        for _ in range(MOST_CLAIMS):
+            node, depth = self._lookup.best_of_many(leg[open_], x[open_])
+            claimed = depth <= 1.0
+            unclaimed.append(open_[~claimed])
+            open_, node = open_[claimed], node[claimed]
+            if not len(open_):
+                break
+            home = self.bring_home(node, x[open_])
+            self.counts.covered += int(home.sum())
+            self.counts.false_claims += int((~home).sum())
+            open_ = open_[~home]
+        unclaimed.append(open_)
+        return np.sort(np.concatenate(unclaimed))
+
+    def bring_home(self, node: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Let robots follow the tree, count at the nodes how they fared: who came home, (B,).
+
+        A robot whose foot lands where no impact is planned is looked up again and goes on, as the
+        live controller does.
+        """
+        home = np.zeros(len(node), bool)
+        robot, legs = np.arange(len(node)), None
+        came_by: list[tuple[np.ndarray, ...]] = []
+        for _ in range(MOST_LANDINGS):
+            done = self.roll_out(node, x)
+            assert done.visits is not None
+            seen = (done.visits.node >= 0) & np.isfinite(done.visits.cost)
+            rows = np.broadcast_to(robot[:, None], seen.shape)[seen]
+            came_by.append((rows, done.visits.node[seen], done.visits.cost[seen]))
+            home[robot] = done.outcome == Outcome.ARRIVED
+            left = done.outcome == Outcome.LEFT
+            robot, legs, x = robot[left], done.stance[left], done.state[left]
+            if not len(robot):
+                break
+            node, depth = self._lookup.best_of_many(legs, x)
+            held = depth <= 1.0
+            robot, node, x = robot[held], node[held], x[held]
+            if not len(robot):
+                break
+        rows, nodes, costs = (np.concatenate(parts) for parts in zip(*came_by, strict=True))
+        self.levels.add(nodes, costs, home[rows])
+        touched = np.unique(nodes)
+        touched = touched[~self.nodes.late[touched]]
+        self.nodes.rho[touched] = self.levels.rho(touched)
+        self._lookup.refresh()
+        return home
+
+    def roll_out(self, node: np.ndarray, x: np.ndarray) -> Rollouts:
+        """The exact hybrid robot under the law, each from its node."""
+        self.counts.rollouts += len(node)
+        return follow(
+            self.nodes,
+            self.model,
+            node,
+            x,
+            self.nodes.to_go[node] + AT_HOME,
+            goal=self.tree.goal,
+            settings=self.settings,
+            options=self.simulation,
+            visits=VISITS,
+            threads=self.threads,
+        )
+
+    def _plan_for(self, leg: np.ndarray, x: np.ndarray, rng: np.random.Generator) -> bool:
+        """Plan for states, and take over the branches that hold what they promise."""
+        self.counts.planned += len(leg)
+        grown = False
+        for row, branch in enumerate(self.extend(self.nodes, leg, x)):
+            if branch is not None and self._grow(branch, x[row]):
+                self._probe(rng)
+                self.counts.grown += 1
+                grown = True
+        return grown
+
+    def _grow(self, branch: Branch, x: np.ndarray) -> bool:
+        """Graft a branch, if it brings home the state that it was planned for."""
+        before = self.tree, self.levels
+        nodes = self.nodes.grafted(branch.trajectory, self.model, branch.onto, branch.elapsed)
+        self._take(nodes)
+        if self.bring_home(np.array([nodes.first]), x[None])[0]:
+            return True
+        self.tree, self.levels = before
+        self._lookup = Lookup(self.nodes)
+        self.counts.rejected += 1
+        return False
+
+    def _take(self, nodes: Nodes) -> None:
+        self._first = len(self.nodes)
+        self.tree = replace(self.tree, nodes=nodes)
+        self.levels = self.levels.extended(len(nodes))
+        self._lookup = Lookup(nodes)
+
+    def _probe(self, rng: np.random.Generator) -> None:
+        """Try the funnels of the last branch with states drawn around its nodes."""
+        nodes, count = self.nodes, self.options.probes
+        new = np.arange(self._first, len(nodes))
+        new = new[~nodes.late[new] & (nodes.span[new] > 0)]
+        node = np.repeat(new, count)
+        if not len(node):
+            return
+        low, high = np.log(self.options.probe_costs)
+        direction = rng.standard_normal((len(node), nodes.x0.shape[1]))
+        direction /= np.linalg.norm(direction, axis=1)[:, None]
+        # x - x0 = sqrt(c) L^-T d has the cost c, with S = L L'.
+        root = np.linalg.cholesky(_definite(nodes.S[node]))
+        offset = np.linalg.solve(root.transpose(0, 2, 1), direction[:, :, None])[:, :, 0]
+        cost = np.exp(rng.uniform(low, high, len(node)))
+        x = nodes.x0[node] + np.sqrt(cost)[:, None] * offset
+        order = np.argsort(cost, kind='stable')
+        # From the inside out: what an inner failure has cut away need not be tried.
+        for rows in np.array_split(order, PROBE_SHELLS):
+            rows = rows[cost[rows] <= nodes.rho[node[rows]]]
+            if len(rows):
+                self.bring_home(node[rows], x[rows])
+
+
+def _definite(S: np.ndarray) -> np.ndarray:
+    """S, kept from being singular: along a direction that costs nothing nobody is drawn far."""
+    trace = np.trace(S, axis1=1, axis2=2) / S.shape[1]
+    return S + 1e-6 * trace[:, None, None] * np.eye(S.shape[1])
