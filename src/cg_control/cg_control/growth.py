@@ -74,11 +74,13 @@ class Branch:
         trajectory: With gains, and the cost to go of the tree at its end.
         onto: Node at which it ends,
         elapsed: or so much later, s.
+        funnels: Forms F of the funnels at the knots of each phase, shapes (n, nx, nx).
     """
 
     trajectory: Trajectory
     onto: int
     elapsed: float = 0.0
+    funnels: tuple[np.ndarray, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -254,7 +256,9 @@ class Grower:
     def _grow(self, branch: Branch, x: np.ndarray) -> bool:
         """Graft a branch, if it brings home the state that it was planned for."""
         before = self.tree, self.levels
-        nodes = self.nodes.grafted(branch.trajectory, self.model, branch.onto, branch.elapsed)
+        nodes = self.nodes.grafted(
+            branch.trajectory, self.model, branch.onto, branch.elapsed, funnels=branch.funnels
+        )
         self._take(nodes)
         if self.bring_home(np.array([nodes.first]), x[None])[0]:
             return True
@@ -280,8 +284,8 @@ class Grower:
         low, high = np.log(self.options.probe_costs)
         direction = rng.standard_normal((len(node), nodes.x0.shape[1]))
         direction /= np.linalg.norm(direction, axis=1)[:, None]
-        # x - x0 = sqrt(c) L^-T d has the cost c, with S = L L'.
-        root = np.linalg.cholesky(_definite(nodes.S[node]))
+        # x - x0 = sqrt(c) L^-T d has the cost c, with F = L L'.
+        root = np.linalg.cholesky(_definite(nodes.F[node]))
         offset = np.linalg.solve(root.transpose(0, 2, 1), direction[:, :, None])[:, :, 0]
         cost = np.exp(rng.uniform(low, high, len(node)))
         x = nodes.x0[node] + np.sqrt(cost)[:, None] * offset
@@ -293,7 +297,7 @@ class Grower:
                 self.bring_home(node[rows], x[rows])
 
 
-def _definite(S: np.ndarray) -> np.ndarray:
-    """S, kept from being singular: along a direction that costs nothing nobody is drawn far."""
-    trace = np.trace(S, axis1=1, axis2=2) / S.shape[1]
-    return S + 1e-6 * trace[:, None, None] * np.eye(S.shape[1])
+def _definite(F: np.ndarray) -> np.ndarray:
+    """F, kept from being singular: along a direction that costs nothing nobody is drawn far."""
+    trace = np.trace(F, axis1=1, axis2=2) / F.shape[1]
+    return F + 1e-6 * trace[:, None, None] * np.eye(F.shape[1])

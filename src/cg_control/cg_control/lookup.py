@@ -1,8 +1,8 @@
 """Which nodes of a tree claim a state, and which claims it best: one product of a matrix.
 
-The cost to go of a deviation is a quadratic form, hence linear in the monomials of the state,
+The cost of a deviation in a funnel is a quadratic form, linear in the monomials of the state,
 
-    (x - x0)' S (x - x0) = c . m(x),   m(x) = (x_i x_j for i <= j, x_i, 1)             (LIFT)
+    (x - x0)' F (x - x0) = c . m(x),   m(x) = (x_i x_j for i <= j, x_i, 1)             (LIFT)
 
 so that the costs of all nodes on a leg are one matrix times m(x): 15 numbers a node. The *depth*
 of a state at a node is its cost over the level of the funnel, cost / rho: inside if 1 or less. The
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_control.nodes import Nodes
+from cg_control.nodes import Nodes, triangles
 from cg_dynamics.rig import STANCES
 
 UNCUT = 1e6  # level that stands for an infinite one: 100 times the cost at which robots fall
@@ -43,13 +43,10 @@ def monomials(x: np.ndarray) -> np.ndarray:
     return np.concatenate([x[..., i] * x[..., j], x, np.ones((*x.shape[:-1], 1))], axis=-1)
 
 
-def lifted(x0: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """Coefficients c of (LIFT) for nodes x0 (n, nx) and S (n, nx, nx): shape (n, features)."""
-    nx = x0.shape[1]
-    i, j = np.triu_indices(nx)
-    quadratic = S[:, i, j] * np.where(i == j, 1.0, 2.0)
-    Sx = np.einsum('nij,nj->ni', S, x0)
-    return np.column_stack([quadratic, -2.0 * Sx, np.einsum('ni,ni->n', x0, Sx)])
+def lifted(x0: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """Coefficients c of (LIFT) for nodes x0 (n, nx) and F (n, nx, nx): shape (n, features)."""
+    Fx = np.einsum('nij,nj->ni', F, x0)
+    return np.column_stack([triangles(F), -2.0 * Fx, np.einsum('ni,ni->n', x0, Fx)])
 
 
 class Lookup:
@@ -65,7 +62,7 @@ class Lookup:
         self._i, self._j = np.triu_indices(nx)
         self._features = np.ones(len(self._i) + nx + 1)
         self._squares, self._linear = len(self._i), slice(len(self._i), len(self._i) + nx)
-        self._all = lifted(nodes.x0, nodes.S)
+        self._all = lifted(nodes.x0, nodes.F)
         self.refresh()
 
     def refresh(self) -> None:

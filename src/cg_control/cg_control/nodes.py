@@ -15,6 +15,7 @@ state is claimed by them.
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,13 +44,14 @@ class Nodes:
         u0: Nominal torque in N m, shape (n,).
         K: Gains of u = u0 - K (x - x0), shape (n, nx).
         S: Cost to go of a deviation, shape (n, nx, nx).
+        F: Form of the funnel, shape (n, nx, nx): S, unless another one was given.
         span: Time to `next` in s; 0 is a link, infinite is rest: shape (n,).
         next: Successor in time on the same leg, -1 at rest, shape (n,).
         landing: Where the reference goes when the foot lands, -1 where no impact is ahead: (n,).
         late: Whether the node lies beyond a late impact, shape (n,).
         time: Instant on the clock of its trajectory in s, shape (n,).
         branch: Number of the trajectory that brought it, 0 is a root, shape (n,).
-        rho: Level of the funnel, x claimed by a node if (x - x0)' S (x - x0) <= rho: infinite
+        rho: Level of the funnel, x claimed by a node if (x - x0)' F (x - x0) <= rho: infinite
             until cut. 0, which claims nothing, beyond a late impact and at a planned one: there
             the foot is on the ground, and it depends on rounding whether it has landed. Shape
             (n,); the one array that may be written.
@@ -63,6 +65,7 @@ class Nodes:
     u0: np.ndarray
     K: np.ndarray
     S: np.ndarray
+    F: np.ndarray
     span: np.ndarray
     next: np.ndarray
     landing: np.ndarray
@@ -82,6 +85,7 @@ class Nodes:
         model_hash: str,
         compensate: bool = False,
         rho: float = math.inf,
+        funnel: np.ndarray | None = None,
     ) -> 'Nodes':
         """A tree of one node: the equilibrium at zero on one leg, held by its balance controller.
 
@@ -92,17 +96,21 @@ class Nodes:
             model_hash: Of the model.
             compensate: As the attribute.
             rho: Level of the funnel.
+            funnel: Its form F, shape (nx, nx); None takes S.
         """
         K = np.array(gain, float).ravel()
         nx = len(K)
         S = np.array(cost_to_go, float)
         if S.shape != (nx, nx):
             raise ValueError(f'cost_to_go has shape {S.shape}, the gain has {nx} entries')
+        F = S if funnel is None else np.array(funnel, float)
+        if F.shape != (nx, nx):
+            raise ValueError(f'funnel has shape {F.shape}, the gain has {nx} entries')
         whole, zero = np.zeros(1, np.int32), np.zeros(1)
         return cls(
             whole + STANCES.index(stance), np.zeros((1, nx)), np.zeros((1, nx)), zero, K[None],
-            S[None], zero + math.inf, whole - 1, whole - 1, np.zeros(1, bool), zero.copy(), whole,
-            zero + rho, model_hash, compensate,
+            S[None], F[None], zero + math.inf, whole - 1, whole - 1, np.zeros(1, bool),
+            zero.copy(), whole, zero + rho, model_hash, compensate,
         )  # fmt: skip
 
     @classmethod
@@ -144,7 +152,7 @@ class Nodes:
             TrajectoryError: naming the array, the node and what is allowed.
         """
         n, nx = len(self), self.x0.shape[-1]
-        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'S': (nx, nx)}
+        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'S': (nx, nx), 'F': (nx, nx)}
         for name in ARRAYS:
             array, shape = getattr(self, name), (n, *tails.get(name, ()))
             if np.shape(array) != shape:
@@ -196,6 +204,7 @@ class Nodes:
         onto: int,
         elapsed: float = 0.0,
         late: float = LATE,
+        funnels: Sequence[np.ndarray] | None = None,
     ) -> 'Nodes':
         """This tree and a trajectory that ends on it.
 
@@ -206,6 +215,7 @@ class Nodes:
             elapsed: Or so much later, at most that node's span, s: between two nodes the tree
                 gets one more.
             late: How long the reference goes on while an impact is late, s.
+            funnels: Forms F at the knots of each phase, shapes (n, nx, nx); None takes S.
 
         Raises:
             TrajectoryError: for another model, another leg or another way to treat friction.
@@ -229,7 +239,10 @@ class Nodes:
         number = int(tree.branch.max()) + 1
         last = len(trajectory.phases) - 1
         blocks = [
-            _block(phase, number, self, *_beyond(phase, model, self, late if i < last else 0.0))
+            _block(
+                phase, number, self, phase.cost_to_go if funnels is None else funnels[i],
+                *_beyond(phase, model, self, late if i < last else 0.0),
+            )
             for i, phase in enumerate(trajectory.phases)
         ]
         starts = np.cumsum([len(tree), *map(len, blocks)])
@@ -310,12 +323,12 @@ class Nodes:
 
     @functools.cached_property
     def costs(self) -> np.ndarray:
-        """S on the way to `next`: its value and what it grows by in a second: (n, 2, nx, nx)."""
+        """F on the way to `next`: its value and what it grows by in a second: (n, 2, nx, nx)."""
         moves = np.isfinite(self.span) & (self.span > 0)
         then = np.where(moves, self.next, 0)
         h = np.where(moves, self.span, 1.0)[:, None, None]
-        slope = np.where(moves[:, None, None], (self.S[then] - self.S) / h, 0.0)
-        return np.stack([self.S, slope], axis=1)
+        slope = np.where(moves[:, None, None], (self.F[then] - self.F) / h, 0.0)
+        return np.stack([self.F, slope], axis=1)
 
     @functools.cached_property
     def forms(self) -> np.ndarray:
@@ -323,12 +336,17 @@ class Nodes:
         return triangles(self.costs)
 
     def cost_to_go(self, node: int, elapsed: float, x: np.ndarray) -> float:
-        """(x - x0)' S (x - x0) at a point of the tree, for a state (nx,)."""
+        """(x - x0)' F (x - x0) at a point of the tree, for a state (nx,)."""
         nx = self.x0.shape[1]
         reference = elapsed ** np.arange(4.0) @ self.edges[node]
-        S = self.costs[node, 0] + elapsed * self.costs[node, 1]
+        F = self.costs[node, 0] + elapsed * self.costs[node, 1]
         deviation = x - reference[1 : 1 + nx]
-        return float(deviation @ S @ deviation)
+        return float(deviation @ F @ deviation)
+
+    def at(self, node: int, elapsed: float) -> np.ndarray:
+        """Cost to go S at a point of the tree, shape (nx, nx): linear between nodes."""
+        share = elapsed / self.span[node] if 0 < self.span[node] < math.inf else 0.0
+        return (1 - share) * self.S[node] + share * self.S[max(self.next[node], 0)]
 
     def _opened(self, onto: int, elapsed: float) -> tuple['Nodes', int]:
         """The tree with a node at a point, and that node's index."""
@@ -349,7 +367,8 @@ class Nodes:
         point = replace(
             one, x0=x0[None], u0=u0, K=K[None],
             rates=(slopes @ self.edges[onto])[None, 1 : 1 + nx],
-            S=(self.costs[onto, 0] + elapsed * self.costs[onto, 1])[None],
+            S=self.at(onto, elapsed)[None],
+            F=(self.costs[onto, 0] + elapsed * self.costs[onto, 1])[None],
             span=one.span - elapsed, time=one.time + elapsed, rho=np.full(1, math.inf),
         )  # fmt: skip
         return _concatenated([self, point]), len(self)
@@ -359,8 +378,8 @@ class Nodes:
 
 
 ARRAYS = (
-    'stance', 'x0', 'rates', 'u0', 'K', 'S', 'span', 'next', 'landing', 'late', 'time', 'branch',
-    'rho',
+    'stance', 'x0', 'rates', 'u0', 'K', 'S', 'F', 'span', 'next', 'landing', 'late', 'time',
+    'branch', 'rho',
 )  # fmt: skip
 
 
@@ -378,7 +397,8 @@ def _concatenated(parts: list[Nodes]) -> Nodes:
 
 
 def _block(
-    phase: Phase, number: int, tree: Nodes, time: np.ndarray, states: np.ndarray, rates: np.ndarray
+    phase: Phase, number: int, tree: Nodes, funnel: np.ndarray,
+    time: np.ndarray, states: np.ndarray, rates: np.ndarray,
 ) -> Nodes:
     """The nodes of a phase and of what follows while its impact is late; `next` is from 0 on."""
     m, n = len(phase.time), len(phase.time) + len(time)
@@ -393,6 +413,7 @@ def _block(
         u0=phase.torque[held],
         K=phase.gains[held],
         S=phase.cost_to_go[held],
+        F=funnel[held],
         span=np.append(np.diff(instants), math.inf),
         next=np.append(np.arange(1, n), -1).astype(np.int32),
         landing=np.full(n, -1, np.int32),

@@ -105,19 +105,18 @@ class Tree:
         n, nx = len(arrays['stance']), arrays['x0'].shape[-1]
         if not 1 <= n <= MOST_NODES:
             raise TreeError(f'{n} nodes; allowed are 1 to {MOST_NODES}')
-        shapes = {'x0': (n, nx), 'rates': (n, nx), 'K': (n, nx), 'S': (n, nx, nx),
-                  'goal': (len(STANCES), nx, nx)}  # fmt: skip
-        for name in (*ARRAYS, 'goal'):
-            shape = shapes.get(name, (n,))
-            if arrays[name].shape != shape:
-                raise TreeError(f'{name} has shape {arrays[name].shape}, expected {shape}')
-        _require_sound(arrays, n)
-        # Numbers of the size of a pointer in the file, of C's int in memory.
+        if arrays['goal'].shape != (len(STANCES), nx, nx):
+            raise TreeError(f'goal has shape {arrays["goal"].shape}, expected (2, {nx}, {nx})')
         nodes = Nodes(
             **{k: arrays[k].astype(np.int32) if k in INTEGERS else arrays[k] for k in ARRAYS},
             model_hash=header['model_hash'],
             compensate=bool(header['compensate']),
         )
+        try:
+            nodes.require_consistency()
+        except TrajectoryError as error:
+            raise TreeError(str(error)) from None
+        _require_goal(arrays['goal'])
         if np.isnan(nodes.to_go).any():
             node = int(np.flatnonzero(np.isnan(nodes.to_go))[0])
             raise TreeError(f'node {node} leads round and round, and never home')
@@ -168,35 +167,12 @@ def _header(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     return header
 
 
-def _require_sound(arrays: dict[str, np.ndarray], n: int) -> None:
-    """Refuse numbers that no tree holds."""
-    for name in ('x0', 'rates', 'u0', 'K', 'S', 'time'):
-        if not np.isfinite(arrays[name]).all():
-            raise TreeError(f'{name} must be finite numbers')
-    for name, low, high in (
-        ('stance', 0, len(STANCES)), ('next', -1, n), ('landing', -1, n), ('branch', 0, n),
-    ):  # fmt: skip
-        values = arrays[name]
-        if not ((values >= low) & (values < high)).all():
-            raise TreeError(f'{name} must be {low} to {high - 1}')
-    for name in ('span', 'rho'):
-        if not (arrays[name] >= 0).all():  # NaN is refused too
-            raise TreeError(f'{name} must not be negative')
-    ends = arrays['next'] < 0
-    if (np.isinf(arrays['span']) != ends).any():
-        raise TreeError('a node without a successor must rest, and no other may')
-    legs = arrays['stance']
-    if (legs[arrays['next'][~ends]] != legs[~ends]).any():
-        raise TreeError('next leads to the other leg')
-    lands = arrays['landing'] >= 0
-    if (legs[arrays['landing'][lands]] == legs[lands]).any():
-        raise TreeError('landing stays on the leg')
-    goals = arrays['goal']
-    for form in goals:
+def _require_goal(goal: np.ndarray) -> None:
+    """Refuse goal regions that are none."""
+    for form in goal:
         if np.isnan(form).all():
             continue
         if not np.isfinite(form).all() or np.linalg.eigvalsh((form + form.T) / 2).min() <= 0:
             raise TreeError('goal must be positive definite on a leg, or NaN')
-    if np.isnan(goals).all():
+    if np.isnan(goal).all():
         raise TreeError('goal must be positive definite on one leg at least')
-
