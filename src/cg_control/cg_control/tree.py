@@ -117,6 +117,9 @@ class Tree:
         except TrajectoryError as error:
             raise TreeError(str(error)) from None
         _require_goal(arrays['goal'])
+        homes = nodes.stance[(nodes.next < 0) & ~nodes.late]
+        if np.isnan(arrays['goal'][homes]).any():
+            raise TreeError('a root stands on a leg that is no goal')
         if np.isnan(nodes.to_go).any():
             node = int(np.flatnonzero(np.isnan(nodes.to_go))[0])
             raise TreeError(f'node {node} leads round and round, and never home')
