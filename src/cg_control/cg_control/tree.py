@@ -117,7 +117,7 @@ class Tree:
         except TrajectoryError as error:
             raise TreeError(str(error)) from None
         _require_goal(arrays['goal'])
-        homes = nodes.stance[(nodes.next < 0) & ~nodes.late]
+        homes = nodes.stance[nodes.planned < 0]
         if np.isnan(arrays['goal'][homes]).any():
             raise TreeError('a root stands on a leg that is no goal')
         if np.isnan(nodes.to_go).any():
