@@ -18,6 +18,7 @@ import numpy as np
 from cg_control.nodes import ARRAYS, Nodes
 from cg_control.trajectory import TrajectoryError
 from cg_description.model_file import write_atomically
+from cg_description.reading import parse_json
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
@@ -155,9 +156,10 @@ def _unpacked(path: Path) -> dict[str, np.ndarray]:
 
 def _header(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     try:
-        header = json.loads(arrays[HEADER].tobytes().decode())
-    except ValueError as error:
-        raise TreeError(f'header is damaged: {error}') from None
+        text = arrays[HEADER].tobytes().decode()
+    except UnicodeDecodeError:
+        raise TreeError('header is not UTF-8') from None
+    header = parse_json(text, HEADER, TreeError)
     if not isinstance(header, dict) or header.get('format') != FORMAT:
         raise TreeError(f'not a tree: format must be {FORMAT!r}')
     if not isinstance(header.get('model_hash'), str) or 'compensate' not in header:
