@@ -1,0 +1,220 @@
+"""Motions from states that nobody claims onto a tree: docs/trees.md, "Extension".
+
+For each state motions are tried in this order, and the first one found is taken:
+
+    onto the tree    on the leg that stands, ending anywhere on the stretch behind the node at
+                     which the state is least deep; whatever steps that branch takes come with it
+    home             in none, one, ... steps, ending upright on a leg that is a goal
+
+What the screen of reach.py rules out is not tried. Gains and funnels come from two Riccati
+equations with the same dynamics. The gains' weights make the robot follow; the funnels' weights
+are `FUNNEL` times as large, so that a deviation costs what it takes to undo it and little for
+being there. A limited torque fails where the former is large: of the states that the balance
+controller brings home from the box of bench/trees_growth.py, the largest ellipsoid with 2 % false
+claims holds 24 % by the gains' cost to go and 65 % by such a one.
+"""
+
+import contextlib
+import dataclasses
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cg_control.collocation import PlanningError, optimise, planning_model
+from cg_control.growth import Branch
+from cg_control.linearise import linearise_stance
+from cg_control.lookup import Lookup
+from cg_control.lqr import lqr
+from cg_control.nodes import Nodes
+from cg_control.reach import Screen, cheap
+from cg_control.task import UPRIGHT, Box, Goal, Stretch, Task
+from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_control.tvlqr import Weights, stabilise
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+
+FUNNEL = 0.03  # weight of deviations in the form of a funnel, as a share of that of the gains
+NEAR = 300.0  # depth up to which the tree itself is a goal
+
+
+def funnel_weights(weights: Weights) -> Weights:
+    """The weights of the funnels that belong to weights of the gains."""
+    names = ('stance_angle', 'swing_angle', 'stance_rate', 'swing_rate')
+    return dataclasses.replace(weights, **{n: FUNNEL * getattr(weights, n) for n in names})
+
+
+def upright_form(model: Model, stance: str, weights: Weights) -> np.ndarray:
+    """Form of the funnel of the upright robot on one leg, shape (4, 4)."""
+    linear, light = linearise_stance(model, stance), funnel_weights(weights)
+    return lqr(linear.A, linear.B, light.Q(stance), light.R).S
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A motion to try, with what has to be known of the tree where it may end.
+
+    Attributes:
+        task: What is asked.
+        zeta: (CAPTURE) of its start.
+        node: Nodes at which it may end, or after which, shape (m,).
+        span: Time to the next node, s, shape (m,).
+        S: Cost to go at these nodes and at the next ones, shape (m, 2, 4, 4).
+        F: Forms of the funnels likewise.
+    """
+
+    task: Task
+    zeta: float
+    node: np.ndarray
+    span: np.ndarray
+    S: np.ndarray
+    F: np.ndarray
+
+    @classmethod
+    def on(cls, nodes: Nodes, node: np.ndarray, task: Task, zeta: float) -> 'Attempt':
+        """An attempt to end at, or behind, nodes of a tree."""
+        then = np.maximum(nodes.next[node], 0)
+        S, F = (np.stack([a[node], a[then]], axis=1) for a in (nodes.S, nodes.F))
+        return cls(task, zeta, node, nodes.span[node], S, F)
+
+    def end(self, onto: int, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """S and F at a point of the tree, (4, 4) each."""
+        row = int(np.flatnonzero(self.node == onto)[0])
+        share = elapsed / self.span[row] if 0 < elapsed < np.inf else 0.0
+        return tuple((1 - share) * a[row, 0] + share * a[row, 1] for a in (self.S, self.F))
+
+
+@dataclass(frozen=True)
+class ExtensionOptions:
+    """What is tried.
+
+    Attributes:
+        steps: Most steps of a motion that goes home.
+        reach: Least step length, m.
+        fine: Intervals a phase.
+        friction: Plan with friction; otherwise the controller gives it back.
+        weights: Of the gains.
+    """
+
+    steps: int = 2
+    reach: float = 0.12
+    fine: int = 20
+    friction: bool = True
+    weights: Weights = field(default_factory=Weights)
+
+
+class Extension:
+    """Plans from states onto a tree. Called with (nodes, legs, states), as `Grower` does.
+
+    Args:
+        model: The robot.
+        goals: Legs on which upright is home.
+        options: What is tried.
+        workers: Processes that plan; 1 plans here. Results do not depend on it.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        goals: Sequence[str] = STANCES,
+        options: ExtensionOptions | None = None,
+        workers: int = 1,
+    ):
+        self.model, self.goals = model, tuple(goals)
+        self.options = options or ExtensionOptions()
+        plant = planning_model(model, self.options.friction)
+        self._screen = Screen(plant, reach=self.options.reach)
+        self._pool: ProcessPoolExecutor | None = None
+        if workers > 1:
+            self._pool = ProcessPoolExecutor(
+                workers, multiprocessing.get_context('spawn'), _prepare, (model, self.options)
+            )
+
+    def close(self) -> None:
+        """End the workers."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def promising(self, legs: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Least number of steps of a motion that may exist, shape (n,); more than allowed: none."""
+        least = np.full(len(legs), self.options.steps + 1)
+        for leg, stance in enumerate(STANCES):
+            rows = np.flatnonzero(np.asarray(legs) == leg)
+            if len(rows):
+                reach = self._screen.reach(stance, x[rows])
+                for steps in range(self.options.steps, -1, -1):
+                    least[rows[reach.allows(steps)]] = steps
+        return least
+
+    def __call__(
+        self, nodes: Nodes, legs: np.ndarray, x: np.ndarray
+    ) -> list[Branch | None]:
+        """A branch for each state, or None."""
+        least, orders = self.promising(legs, x), []
+        node, depth = Lookup(nodes).best_of_many(np.asarray(legs), x)
+        for leg, state, steps, near, deep in zip(legs, x, least, node, depth, strict=True):
+            order: list[Attempt] = []
+            if steps <= self.options.steps:
+                if near >= 0 and deep < NEAR:
+                    order += self._onto(nodes, int(near), int(leg), state)
+                order += self._home(nodes, int(leg), state, int(steps))
+            orders.append(order)
+        if self._pool is None:
+            return [first_of(order, self.model, self.options) for order in orders]
+        return list(self._pool.map(_in_worker, orders))
+
+    def _onto(self, nodes: Nodes, node: int, leg: int, x: np.ndarray) -> Iterator[Attempt]:
+        with contextlib.suppress(ValueError):  # the robot rests there, or lands
+            goal = Stretch.along(nodes, node)
+            yield self._attempt(nodes, np.asarray(goal.node), (STANCES[leg],), goal, x)
+
+    def _home(self, nodes: Nodes, leg: int, x: np.ndarray, steps: int) -> Iterator[Attempt]:
+        for count in range(steps, self.options.steps + 1):
+            modes = tuple(STANCES[(leg + k) % 2] for k in range(count + 1))
+            if modes[-1] in self.goals:
+                last = STANCES.index(modes[-1])
+                roots = np.flatnonzero((nodes.planned < 0) & (nodes.stance == last))[:1]
+                yield self._attempt(nodes, roots, modes, UPRIGHT, x)
+
+    def _attempt(
+        self, nodes: Nodes, node: np.ndarray, modes: tuple[str, ...], goal: Goal, x: np.ndarray
+    ) -> Attempt:
+        task = Task(modes, start=Box.point(x), goal=goal, reach=self.options.reach)
+        zeta = float(self._screen.zeta(modes[0], x[None])[0])
+        return Attempt.on(nodes, node, task, zeta)
+
+
+def first_of(order: Sequence[Attempt], model: Model, options: ExtensionOptions) -> Branch | None:
+    """The first motion that is found, with gains and funnels; None if there is none."""
+    for attempt in order:
+        how = cheap(len(attempt.task.modes) - 1, attempt.zeta, options.fine)
+        with contextlib.suppress(PlanningError, TrajectoryError):
+            return _branch(optimise(model, attempt.task, how, options.friction), attempt,
+                           model, options)  # fmt: skip
+    return None
+
+
+def _branch(
+    motion: Trajectory, attempt: Attempt, model: Model, options: ExtensionOptions
+) -> Branch:
+    onto = int(motion.provenance.get('onto', attempt.node[0]))
+    elapsed = float(motion.provenance.get('elapsed', 0.0))
+    S, F = attempt.end(onto, elapsed)
+    light = stabilise(motion, model, funnel_weights(options.weights), F)
+    followed = stabilise(motion, model, options.weights, S)
+    return Branch(followed, onto, elapsed, tuple(p.cost_to_go for p in light.phases))
+
+
+_of_worker: tuple[Model, ExtensionOptions] | None = None
+
+
+def _prepare(model: Model, options: ExtensionOptions) -> None:
+    global _of_worker
+    _of_worker = model, options
+
+
+def _in_worker(order: Sequence[Attempt]) -> Branch | None:
+    assert _of_worker is not None
+    return first_of(order, *_of_worker)
