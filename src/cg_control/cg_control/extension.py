@@ -2,9 +2,9 @@
 
 For each state motions are tried in this order, and the first one found is taken:
 
+    home             in none, one, ... steps, ending upright on a leg that is a goal
     onto the tree    on the leg that stands, ending anywhere on the stretch behind the node at
                      which the state is least deep; whatever steps that branch takes come with it
-    home             in none, one, ... steps, ending upright on a leg that is a goal
 
 What the screen of reach.py rules out is not tried. Gains and funnels come from two Riccati
 equations with the same dynamics. The gains' weights make the robot follow; the funnels' weights
@@ -29,6 +29,7 @@ from cg_control.linearise import linearise_stance
 from cg_control.lookup import Lookup
 from cg_control.lqr import lqr
 from cg_control.nodes import Nodes
+from cg_control.program import Guess
 from cg_control.reach import Screen, cheap
 from cg_control.task import UPRIGHT, Box, Goal, Stretch, Task
 from cg_control.trajectory import Trajectory, TrajectoryError
@@ -37,7 +38,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
 FUNNEL = 0.03  # weight of deviations in the form of a funnel, as a share of that of the gains
-NEAR = 300.0  # depth up to which the tree itself is a goal
+SOON = Guess(0.15, 0.3)  # what joins the tree nearby takes no longer
 
 
 def funnel_weights(weights: Weights) -> Weights:
@@ -58,7 +59,6 @@ class Attempt:
 
     Attributes:
         task: What is asked.
-        zeta: (CAPTURE) of its start.
         node: Nodes at which it may end, or after which, shape (m,).
         span: Time to the next node, s, shape (m,).
         S: Cost to go at these nodes and at the next ones, shape (m, 2, 4, 4).
@@ -66,18 +66,17 @@ class Attempt:
     """
 
     task: Task
-    zeta: float
     node: np.ndarray
     span: np.ndarray
     S: np.ndarray
     F: np.ndarray
 
     @classmethod
-    def on(cls, nodes: Nodes, node: np.ndarray, task: Task, zeta: float) -> 'Attempt':
+    def on(cls, nodes: Nodes, node: np.ndarray, task: Task) -> 'Attempt':
         """An attempt to end at, or behind, nodes of a tree."""
         then = np.maximum(nodes.next[node], 0)
         S, F = (np.stack([a[node], a[then]], axis=1) for a in (nodes.S, nodes.F))
-        return cls(task, zeta, node, nodes.span[node], S, F)
+        return cls(task, node, nodes.span[node], S, F)
 
     def end(self, onto: int, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """S and F at a point of the tree, (4, 4) each."""
@@ -91,18 +90,22 @@ class ExtensionOptions:
     """What is tried.
 
     Attributes:
-        steps: Most steps of a motion that goes home.
+        steps: Most steps of a motion that goes home. Two found 1 motion in 459 tries where one had
+            failed.
         reach: Least step length, m.
         fine: Intervals a phase.
         friction: Plan with friction; otherwise the controller gives it back.
         weights: Of the gains.
+        near: Depth up to which a motion onto the tree is tried where none goes home; 0: never. Up
+            to a depth of 5 it found 1 motion in 493 tries, at 13 ms each.
     """
 
-    steps: int = 2
+    steps: int = 1
     reach: float = 0.12
     fine: int = 20
-    friction: bool = True
+    friction: bool = False
     weights: Weights = field(default_factory=Weights)
+    near: float = 0.0
 
 
 class Extension:
@@ -138,7 +141,7 @@ class Extension:
             self._pool.shutdown(cancel_futures=True)
 
     def promising(self, legs: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Least number of steps of a motion that may exist, shape (n,); more than allowed: none."""
+        """Least number of steps of a motion that may exist, (n,); more than allowed: none."""
         least = np.full(len(legs), self.options.steps + 1)
         for leg, stance in enumerate(STANCES):
             rows = np.flatnonzero(np.asarray(legs) == leg)
@@ -157,9 +160,9 @@ class Extension:
         for leg, state, steps, near, deep in zip(legs, x, least, node, depth, strict=True):
             order: list[Attempt] = []
             if steps <= self.options.steps:
-                if near >= 0 and deep < NEAR:
-                    order += self._onto(nodes, int(near), int(leg), state)
                 order += self._home(nodes, int(leg), state, int(steps))
+                if near >= 0 and deep < self.options.near:
+                    order += self._onto(nodes, int(near), int(leg), state)
             orders.append(order)
         if self._pool is None:
             return [first_of(order, self.model, self.options) for order in orders]
@@ -182,14 +185,15 @@ class Extension:
         self, nodes: Nodes, node: np.ndarray, modes: tuple[str, ...], goal: Goal, x: np.ndarray
     ) -> Attempt:
         task = Task(modes, start=Box.point(x), goal=goal, reach=self.options.reach)
-        zeta = float(self._screen.zeta(modes[0], x[None])[0])
-        return Attempt.on(nodes, node, task, zeta)
+        return Attempt.on(nodes, node, task)
 
 
 def first_of(order: Sequence[Attempt], model: Model, options: ExtensionOptions) -> Branch | None:
     """The first motion that is found, with gains and funnels; None if there is none."""
     for attempt in order:
-        how = cheap(len(attempt.task.modes) - 1, attempt.zeta, options.fine)
+        how = cheap(len(attempt.task.modes) - 1, options.fine)
+        if isinstance(attempt.task.goal, Stretch):
+            how = dataclasses.replace(how, starts=(SOON,))
         with contextlib.suppress(PlanningError, TrajectoryError):
             return _branch(optimise(model, attempt.task, how, options.friction), attempt,
                            model, options)  # fmt: skip

@@ -31,7 +31,7 @@ from cg_control.tree import Tree
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 
-MOST_CLAIMS = 40  # false claims of one sample in one round, after which it counts as unclaimed
+MOST_CLAIMS = 12  # of one state, after which it counts as unclaimed
 MOST_LANDINGS = 6  # of a robot whose foot lands where no impact is planned
 PROBE_SHELLS = 8
 AT_HOME = 3.0  # s that the balance controller may take beyond the end of the motion
@@ -43,27 +43,26 @@ class Region:
     """The states that are drawn: a box in the roles of the legs, one for both stance legs.
 
     Attributes:
-        lower: (stance angle, swing angle) and rates, in rad and rad/s, shape (nx,).
-        upper: As `lower`.
+        half: Half its edges: lean of the stance leg, angle of the swing leg to it, and their
+            rates, in rad and rad/s, shape (4,); of another mechanism its coordinates, (nx,).
         legs: How many legs can stand.
     """
 
-    lower: np.ndarray
-    upper: np.ndarray
+    half: np.ndarray
     legs: int = 2
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Stance legs (count,) and states (count, nx), in the order of the coordinates."""
         leg = rng.integers(0, self.legs, count)
-        x = rng.uniform(self.lower, self.upper, (count, len(self.lower)))
-        return leg, in_coordinates(leg, x)
+        roles = rng.uniform(-1.0, 1.0, (count, len(self.half))) * self.half
+        return leg, in_coordinates(leg, roles) if len(self.half) == 4 else roles
 
 
 def in_coordinates(leg: np.ndarray, roles: np.ndarray) -> np.ndarray:
-    """(q_inner, q_outer) and rates of states in (stance, swing) and rates; its own inverse."""
-    if roles.shape[-1] != 4:
-        return roles
-    return np.where((np.asarray(leg) == 1)[..., None], roles[..., [1, 0, 3, 2]], roles)
+    """(q_inner, q_outer) and rates (n, 4) of leans, angles to them, and rates (n, 4)."""
+    lean, angle, lean_rate, rate = roles.T
+    x = np.column_stack([lean, lean + angle, lean_rate, lean_rate + rate])
+    return np.where((np.asarray(leg) == 1)[:, None], x[:, [1, 0, 3, 2]], x)
 
 
 @dataclass(frozen=True)
@@ -90,6 +89,8 @@ class GrowthOptions:
     Attributes:
         seed: Of everything that is drawn.
         round_size: States drawn at a time.
+        falsifiers: So many times as many states are drawn besides, whose claims are tried too, but
+            which are not planned for: a claim is tried a hundred times faster than planned.
         at_once: States planned for before the others of a round are looked up again.
         probes: States drawn around each node of a new branch.
         probe_costs: Least and largest cost at which they are drawn.
@@ -98,6 +99,7 @@ class GrowthOptions:
 
     seed: int = 0
     round_size: int = 512
+    falsifiers: int = 8
     at_once: int = 8
     probes: int = 16
     probe_costs: tuple[float, float] = (1e-2, 1e2)
@@ -172,32 +174,45 @@ class Grower:
             grown = self._plan_for(leg[now], x[now], rng)
             if grown and len(open_):
                 open_ = open_[self.look_up(leg[open_], x[open_])]
+        self._falsify(rng)
         self.rounds += 1
         return Counts(**{k: v - getattr(before, k) for k, v in vars(self.counts).items()})
+
+    def _falsify(self, rng: np.random.Generator) -> None:
+        """Try what the tree claims of more states."""
+        covered = self.counts.covered
+        for _ in range(self.options.falsifiers):
+            self.look_up(*self.region.draw(rng, self.options.round_size))
+        self.counts.covered = covered  # of the states that are planned for
 
     def look_up(self, leg: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Simulate what is claimed, cut what was claimed falsely; rows that nobody claims."""
         open_ = np.arange(len(leg))
-        unclaimed: list[np.ndarray] = []
+        failed: list[list[int]] = [[] for _ in leg]
         for _ in range(MOST_CLAIMS):
-            node, depth = self._lookup.best_of_many(leg[open_], x[open_])
-            claimed = depth <= 1.0
-            unclaimed.append(open_[~claimed])
-            open_, node = open_[claimed], node[claimed]
-            if not len(open_):
+            but = [failed[i] for i in open_]
+            node, depth = self._lookup.best_of_many(leg[open_], x[open_], but)
+            claimed = np.flatnonzero(depth <= 1.0)
+            if not len(claimed):
                 break
-            home = self.bring_home(node, x[open_])
+            home = self.bring_home(node[claimed], x[open_[claimed]])
             self.counts.covered += int(home.sum())
             self.counts.false_claims += int((~home).sum())
-            open_ = open_[~home]
-        unclaimed.append(open_)
-        return np.sort(np.concatenate(unclaimed))
+            for k in claimed[~home]:
+                failed[open_[k]].append(int(node[k]))
+            open_ = np.delete(open_, claimed[home])
+        return open_
 
-    def bring_home(self, node: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Let robots follow the tree, count at the nodes how they fared: who came home, (B,).
+    def bring_home(self, node: np.ndarray, x: np.ndarray, learn: bool = True) -> np.ndarray:
+        """Let robots follow the tree: who came home, shape (B,).
 
         A robot whose foot lands where no impact is planned is looked up again and goes on, as the
         live controller does.
+
+        Args:
+            node: Where each begins, shape (B,).
+            x: Their states, shape (B, nx).
+            learn: Count at the nodes how they fared, and set the levels accordingly.
         """
         home = np.zeros(len(node), bool)
         robot, legs = np.arange(len(node)), None
@@ -218,6 +233,8 @@ class Grower:
             robot, node, x = robot[held], node[held], x[held]
             if not len(robot):
                 break
+        if not learn:
+            return home
         rows, nodes, costs = (np.concatenate(parts) for parts in zip(*came_by, strict=True))
         self.levels.add(nodes, costs, home[rows])
         touched = np.unique(nodes)

@@ -13,6 +13,7 @@ part.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,13 +95,27 @@ class Lookup:
         row = depths.argmin()
         return Claim(int(index[row]), max(float(depths[row]), 0.0))
 
-    def best_of_many(self, leg: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `best`, for legs (B,) and states (B, nx): nodes (B,), -1 for none, depths (B,)."""
+    def best_of_many(
+        self, leg: np.ndarray, x: np.ndarray, but: Sequence[Sequence[int]] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `best`, for many states.
+
+        Args:
+            leg: Shape (B,).
+            x: Shape (B, nx).
+            but: Nodes that are out of the question, of each state; none if empty.
+
+        Returns:
+            Nodes (B,), -1 for none, and depths (B,).
+        """
         node, depth = np.full(len(leg), -1), np.full(len(leg), math.inf)
         for number, (index, matrix) in enumerate(zip(self._index, self._matrix, strict=True)):
             rows = np.flatnonzero(leg == number)
             if len(rows) and len(index):
                 depths = monomials(x[rows, : self.nodes.x0.shape[1]]) @ matrix.T
+                for k, row in enumerate(rows):
+                    if but and but[int(row)]:
+                        depths[k, np.isin(index, but[int(row)])] = math.inf
                 best = depths.argmin(axis=1)
                 node[rows] = index[best]
                 depth[rows] = np.maximum(depths[np.arange(len(rows)), best], 0.0)

@@ -74,10 +74,10 @@ class Tree:
             'compensate': self.nodes.compensate,
             'provenance': dict(self.provenance),
         }
-        arrays = {name: getattr(self.nodes, name) for name in ARRAYS} | {'goal': self.goal}
         text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8)
+        arrays: dict[str, Any] = {name: getattr(self.nodes, name) for name in ARRAYS}
         file = io.BytesIO()
-        np.savez_compressed(file, **{HEADER: text}, **arrays)
+        np.savez_compressed(file, **(arrays | {HEADER: text, 'goal': self.goal}))
         write_atomically(path, file.getvalue())
 
     @classmethod
