@@ -5,6 +5,9 @@ are there, and the torque that the drive held since the one before is known. Who
 out at once and in order. One that stays in parts is given out as it is once PATIENCE newer IMU
 samples have come: in lock-step, where nothing moves on without an answer, that never happens.
 
+A machine that died may have owed the torque of its last sample. The next one, which repeats its
+first measurement until somebody answers, is waited with no longer than PATIENCE repetitions.
+
 The stance leg is the one that has just been loaded, or else the only one that is: when the swing
 foot lands, both feet may be down for some samples, and the impact is at the first of them.
 """
@@ -26,11 +29,13 @@ class Sample:
         stamp_ns: Its instant, ns.
         outputs: Channel -> reading.
         contact: Leg -> whether it is loaded.
+        repeated: How often its IMU reading came again.
     """
 
     stamp_ns: int
     outputs: dict[str, float] = field(default_factory=dict)
     contact: dict[str, bool] = field(default_factory=dict)
+    repeated: int = 0
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Gatherer:
         """Readings of one instant."""
         sample = self._at(stamp_ns)
         if sample is not None:
+            sample.repeated += 'imu_angle' in outputs and 'imu_angle' in sample.outputs
             sample.outputs |= outputs
 
     def add_contact(self, stamp_ns: int, leg: str, loaded: bool) -> None:
@@ -92,8 +98,10 @@ class Gatherer:
         while self._waiting:
             stamp_ns = min(self._waiting)
             sample = self._waiting[stamp_ns]
-            newer = sum('imu_angle' in other.outputs for other in self._waiting.values()) - (
-                'imu_angle' in sample.outputs
+            newer = sum(
+                1 + other.repeated
+                for other in self._waiting.values()
+                if other is not sample and 'imu_angle' in other.outputs
             )
             if not self._whole(sample) and newer < PATIENCE:
                 return
@@ -110,7 +118,11 @@ class Gatherer:
         return self._waiting.setdefault(stamp_ns, Sample(stamp_ns))
 
     def _whole(self, sample: Sample) -> bool:
-        known = self._last_ns is None or self._torque_ns >= self._last_ns
+        known = (
+            self._last_ns is None
+            or self._torque_ns >= self._last_ns
+            or sample.repeated >= PATIENCE
+        )
         return (
             known
             and {'imu_angle', 'hip_angle'} <= sample.outputs.keys()

@@ -55,6 +55,20 @@ def test_what_is_late_or_repeated_is_not_given_out_again():
     assert list(gatherer.due()) == []
 
 
+def test_a_machine_that_died_does_not_keep_the_next_one_waiting():
+    """It owes the torque of its last sample; the next one repeats its first measurement."""
+    gatherer = Gatherer()
+    whole(gatherer, 1, torque=1.0)
+    whole(gatherer, 2)
+    assert len(list(gatherer.due())) == 2
+    gatherer.add(3 * T, {'hip_angle': 3.0})  # half a measurement, and no torque at 2
+    given = []
+    for _ in range(3):
+        whole(gatherer, 900)
+        given += gatherer.due()
+    assert [m.stamp_ns // T for m in given] == [3, 900]
+
+
 def test_without_foot_contacts_the_stance_leg_must_be_told_otherwise():
     told = Gatherer(contacts=False)
     told.add(T, {'imu_angle': 0.0, 'hip_angle': 0.0})
