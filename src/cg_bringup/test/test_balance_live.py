@@ -146,16 +146,13 @@ def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):
     assert set(late) == {0.0}
 
 
-@pytest.mark.parametrize('mode', ['lockstep', 'real_time'])
-def test_two_hundred_changes_of_a_weight_disturb_nothing(loop, mode):
-    run = loop(mode=mode, stance='inner', lean=0.03)
+def changes(run, count):
+    """Change a weight so many times; reports of the controller before and meanwhile."""
     client = run.node.create_client(SetParameters, '/balance/set_parameters')
     run.until(lambda: client.service_is_ready() and len(run.applied) > 500)
-    # The same number of samples without changes tells what this machine misses by itself.
     run.until(lambda: len(run.reports) > 3)
-    missed_before = sum(missed for _, missed in run.reports[1:])
-    reports, first = len(run.reports), len(run.applied)
-    for k in range(200):
+    before = len(run.reports)
+    for k in range(count):
         scale = 0.075 if k % 2 else 0.1
         request = SetParameters.Request(
             parameters=[Parameter('lean_scale', value=scale).to_parameter_msg()]
@@ -163,12 +160,28 @@ def test_two_hundred_changes_of_a_weight_disturb_nothing(loop, mode):
         future = client.call_async(request)
         run.until(future.done)
         assert future.result().results[0].successful
+    reports = len(run.reports)
     run.until(lambda: len(run.reports) > reports + 1)
-    assert {text for text, _ in run.reports[reports:]} == {'balancing'}
+    return run.reports[1:before], run.reports[before:]
+
+
+def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
+    run = loop(mode='lockstep', stance='inner', lean=0.03)
+    _, reports = changes(run, 200)
+    assert {text for text, _ in reports} == {'balancing'}
     # It never lets go: zero torque twice in a row is what an idle controller sends.
-    torques = [torque for _, torque in run.applied[first:]]
+    torques = [torque for _, torque in run.applied[500:]]
     assert not any(a == b == 0.0 for a, b in itertools.pairwise(torques))
-    assert max(abs(state.position[0]) for state in run.states[first:]) < 0.1
-    if mode == 'real_time':
-        missed = sum(missed for _, missed in run.reports[reports:])
-        assert missed <= missed_before + 2
+    assert max(abs(state.position[0]) for state in run.states[500:]) < 0.1
+
+
+def test_two_hundred_changes_of_a_weight_make_no_answer_late(loop):
+    # Springs hold the robot up, so that a machine too busy for real time does not end the test.
+    springs = load_experiment('spring_stabilised_inner').setup
+    run = loop(springs, stance='inner', lean=0.0)
+    before, meanwhile = changes(run, 200)
+    missed_before = sum(missed for _, missed in before) / len(before)
+    missed = sum(missed for _, missed in meanwhile) / len(meanwhile)
+    # Deadlines missed in a second. One change that delayed an answer by the 20 ms that starting
+    # a process takes would cost ten of them, and there are dozens of changes in a second.
+    assert missed <= 2 * missed_before + 5
