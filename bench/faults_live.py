@@ -323,7 +323,9 @@ def campaign(times: int, busy: int, rng: np.random.Generator) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--times', type=int, default=20, help='of each fault [20]')
+    parser.add_argument(
+        '--times', type=int, nargs='*', default=[20], help='of each fault, one number a load [20]'
+    )
     parser.add_argument('--loads', type=int, nargs='*', default=[0, 10], help='[0 10]')
     parser.add_argument('--faults', default='', help='only those whose names hold this')
     parser.add_argument('--shout', help=argparse.SUPPRESS)
@@ -334,11 +336,13 @@ def main() -> None:
     for name in list(FAULTS):
         if options.faults not in name:
             del FAULTS[name]
+    times = options.times * len(options.loads) if len(options.times) == 1 else options.times
+    asked = f'--loads {" ".join(map(str, options.loads))} --times {" ".join(map(str, times))}'
     lines = [
         '# Faults on the live system, seen from the drive',
         '',
-        f'`python bench/faults_live.py --times {options.times}`: real time, 500 Hz, each node a '
-        f'process, {os.cpu_count()} cores.',
+        f'`python bench/faults_live.py {asked}`: real time, 500 Hz, each node a process, '
+        f'{os.cpu_count()} cores.',
         f'The watchdog is {STALE * 1e3:g} ms, to which one sample of {SAMPLE * 1e3:g} ms comes.',
         '"Last torque" is the worst instant, after the fault, of a sample with torque; "late"',
         'counts those beyond the watchdog. "Wrong torque" is the largest that acted while nobody',
@@ -346,9 +350,9 @@ def main() -> None:
         'is the start of a new process and what DDS takes to give up the old one (5 s); after a',
         'command dated ahead it is until a good one acts.',
     ]
-    for busy in options.loads:
+    for busy, count in zip(options.loads, times, strict=True):
         print(f'load {busy}', flush=True)
-        rows = campaign(options.times, busy, np.random.default_rng(busy))
+        rows = campaign(count, busy, np.random.default_rng(busy))
         lines += [
             '',
             f'## {busy} busy processes beside it',
@@ -358,8 +362,8 @@ def main() -> None:
             '|---|---:|---:|---:|---:|---:|---:|---:|',
             *rows,
         ]
-    if not options.faults:
-        write_atomically(TARGET, '\n'.join(lines) + '\n')
+        if not options.faults:
+            write_atomically(TARGET, '\n'.join(lines) + '\n')
 
 
 if __name__ == '__main__':
