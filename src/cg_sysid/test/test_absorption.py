@@ -33,7 +33,10 @@ SETUPS = (
 ) * 2
 
 
-@pytest.fixture(scope='module', params=MACHINES)
+@pytest.fixture(
+    scope='module',
+    params=['joint_flexibility', pytest.param('actuator_delay', marks=pytest.mark.evidence)],
+)
 def hidden(request, model_file):
     """Name of an effect, the nominal model, and records of a machine that has it."""
     nominal = Model.load(model_file)

@@ -72,7 +72,7 @@ def test_small_faults_alone_are_consistent(nominal):
     ('effect', 'values'),
     [
         pytest.param('torque_bias', {'bias': 0.3}, marks=pytest.mark.evidence),
-        ('encoder_offset', {'offset': 0.012}),
+        pytest.param('encoder_offset', {'offset': 0.012}, marks=pytest.mark.evidence),
         ('actuator_delay', {'delay': 0.008}),
         pytest.param('quadratic_friction', {'coefficient': 0.2}, marks=pytest.mark.evidence),
     ],
@@ -163,8 +163,8 @@ def test_springs_that_do_not_conspire_are_no_tether(nominal):
          'quadratic_friction'),
         pytest.param('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant',
                      marks=pytest.mark.evidence),
-        ('position_dependent_friction', {'torque': 3.5, 'tightest': 0.4}, ('cycles', 2.0),
-         'asymmetric_friction'),
+        pytest.param('position_dependent_friction', {'torque': 3.5, 'tightest': 0.4},
+                     ('cycles', 2.0), 'asymmetric_friction', marks=pytest.mark.evidence),
     ],
 )  # fmt: skip
 def test_an_effect_by_another_law_is_that_effect_and_not_two(

@@ -114,7 +114,8 @@ def _slow_sweep(machine, k):
     [
         ('joint_flexibility', {'stiffness': 115.0, 'rotor_inertia': 0.09, 'damping': 0.7}),
         ('joint_flexibility', {'stiffness': 300.0, 'rotor_inertia': 0.15, 'damping': 0.4}),
-        ('backlash', {'gap': 0.007, 'rotor_inertia': 0.14}),
+        pytest.param('backlash', {'gap': 0.007, 'rotor_inertia': 0.14},
+                     marks=pytest.mark.evidence),
         ('backlash', {'gap': 0.058, 'rotor_inertia': 0.06}),
     ],
 )
