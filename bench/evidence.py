@@ -41,7 +41,8 @@ def main() -> int:
         status = subprocess.call(
             [
                 *(sys.executable, '-m', 'pytest', '-q', '-n', 'logical', '--dist', 'worksteal'),
-                *('-m', 'evidence', f'--junitxml={report}', str(ROOT / 'src/cg_sysid')),
+                *('-m', 'evidence', f'--junitxml={report}'),
+                *(str(ROOT / 'src' / package) for package in ('cg_sysid', 'cg_bringup')),
             ],
             cwd=ROOT,
         )
