@@ -44,7 +44,7 @@ PATIENCE = 30.0  # s until torque is back
 TORQUE = 7.0  # N m of a command that must not act
 GOOD = 0.5  # N m of one that must
 AHEAD = {'15 ms': 0.015, '3 s': 3.0, '1 h': 3600.0}  # s
-FLOOD = 2.0  # s
+FLOOD = 1.0  # s
 TARGET = Path(__file__).resolve().parent / 'results/faults_live.md'
 
 
