@@ -185,5 +185,5 @@ def test_two_hundred_changes_of_a_weight_make_no_answer_late(loop):
     missed_before = sum(missed for _, missed in before) / len(before)
     missed = sum(missed for _, missed in meanwhile) / len(meanwhile)
     # Deadlines missed in a second. A change that delayed an answer by the 20 ms that starting a
-    # process takes would cost ten of them, and there are some thirty changes in a second.
-    assert missed <= 2 * missed_before + 20
+    # process takes would cost ten of them, at some thirty changes in a second: 300.
+    assert missed <= 2 * missed_before + 60
