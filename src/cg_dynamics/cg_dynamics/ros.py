@@ -170,8 +170,8 @@ def to_nanoseconds(stamp: Time) -> int:
 class Throttled:
     """A way to the log that takes a message at most once in so many s.
 
-    The logger's own throttle looks for its caller in the stack first, which takes 0.5 ms each
-    time, a quarter of a sample.
+    The logger's own throttle looks for its caller in the stack first, each time: too long for a
+    loop of 2 ms.
     """
 
     def __init__(self, log: Callable[[str], Any], period: float = 1.0):
