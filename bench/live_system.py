@@ -1,39 +1,26 @@
-"""The live system in figures: lock-step pace, real-time lateness, bag size, loss after SIGKILL.
+"""The live system in figures: lock-step pace, real-time lateness, bag size.
 
-    ./cg exec python bench/live_system.py [--kills 10] [--duration 10]
+    ./cg exec python bench/live_system.py [--duration 10]
 
 Prints one table. Absolute figures belong to the machine they were taken on.
 """
 
 import argparse
-import os
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
-import rclpy
-from rclpy.node import Node
 from rosbags.highlevel import AnyReader
-from sensor_msgs.msg import Imu, JointState
 
 from cg_bringup.experiment import run_experiment
 from cg_bringup.runs import Run
 from cg_dynamics.domains import own_domain
-from cg_dynamics.ros import SENSOR_QOS, to_stamp
 from cg_sysid.experiments import load_experiment
-from cg_sysid.recover import recover
 
 PERIOD = 0.002  # s
-TOPICS = {
-    '/imu': Imu,
-    '/hip_encoder': JointState,
-    '/applied_torque': JointState,
-    '/torque_command': JointState,
-}
 
 
 def stamps_and_logs(bag: Path) -> dict[str, np.ndarray]:
@@ -108,66 +95,14 @@ def start(module: str, *parameters: str) -> subprocess.Popen:
     )
 
 
-def kill_losses(directory: Path, kills: int) -> list[tuple[str, str]]:
-    """Loss of a recorder that is killed at 4 x 500 Hz."""
-    losses, cpu = [], []
-    for index in range(kills):
-        with own_domain():
-            rclpy.init()
-            node = Node('sender')
-            publishers = {
-                topic: node.create_publisher(kind, topic, SENSOR_QOS)
-                for topic, kind in TOPICS.items()
-            }
-            bag = directory / f'killed{index}'
-            recorder = start('cg_sysid.recorder_node', '-p', f'bag:={bag}')
-            while any(p.get_subscription_count() == 0 for p in publishers.values()):
-                time.sleep(0.01)
-            before = sum(cpu_seconds(recorder.pid))
-            begin = time.monotonic()
-            ticks = 1000 + 3 * index
-            for tick in range(ticks):
-                time.sleep(max(0.0, begin + tick * PERIOD - time.monotonic()))
-                stamp = to_stamp(time.time_ns())
-                for topic, kind in TOPICS.items():
-                    message = kind()
-                    message.header.stamp = stamp
-                    publishers[topic].publish(message)
-            killed_ns = time.time_ns()
-            cpu.append((sum(cpu_seconds(recorder.pid)) - before) / (ticks * PERIOD))
-            os.kill(recorder.pid, signal.SIGKILL)
-            recorder.wait()
-            node.destroy_node()
-            rclpy.try_shutdown()
-        recover(bag)
-        newest = min(pairs[:, 0].max() for pairs in stamps_and_logs(bag).values())
-        losses.append((killed_ns - newest) * 1e-6)
-    return [
-        ('recorder at 4 x 500 Hz', f'{100 * np.mean(cpu):.0f} % of a core'),
-        (
-            f'loss after SIGKILL, {kills} kills',
-            f'median {np.median(losses):.1f}, worst {max(losses):.1f} ms',
-        ),
-    ]
-
-
-def cpu_seconds(pid: int) -> tuple[float, float]:
-    """User and system time of a process in s."""
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    tick = os.sysconf('SC_CLK_TCK')
-    return int(fields[11]) / tick, int(fields[12]) / tick
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--kills', type=int, default=10)
     parser.add_argument('--duration', type=float, default=10.0, help='of each record in s')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         table = lockstep_pace(5000)
         table += experiments(Path(directory), options.duration)
-        table += kill_losses(Path(directory), options.kills)
     width = max(len(name) for name, _ in table)
     for name, value in table:
         print(f'{name:{width}}  {value}')

@@ -103,11 +103,6 @@ class LiveDesign:
             self._log(f'basin sampled: {", ".join(bounds)}')
         return basins
 
-    @property
-    def waiting(self) -> bool:
-        """True while the basin of the present gains is being sampled."""
-        return self._sampler.busy
-
     def close(self) -> None:
         """End the sampling process."""
         self._sampler.close()
