@@ -177,7 +177,12 @@ def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
     assert max(abs(state.position[0]) for state in run.states[500:]) < 0.1
 
 
+@pytest.mark.evidence
 def test_two_hundred_changes_of_a_weight_make_no_answer_late(loop):
+    """By the clock on the wall, which shows what else the machine has to do.
+
+    What a change costs the node itself is in test_balance_node.py of cg_control.
+    """
     # Springs hold the robot up, so that a machine too busy for real time does not end the test.
     springs = load_experiment('spring_stabilised_inner').setup
     run = loop(springs, stance='inner', lean=0.0)
