@@ -5,6 +5,7 @@ for the machine to finish, shuts the others down, checks the bag and prints its 
 """
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from cg_bringup.runs import MODES, Run, experiment_nodes
+from cg_bringup.runs import MODES, PATIENCE, Run, experiment_nodes
 from cg_bringup.supervisor import ProcessDied, supervised
 from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.stop_request import Stopped
@@ -21,8 +22,6 @@ from cg_sysid.experiments import ExperimentError, experiment_names, load_experim
 from cg_sysid.progress import Bars
 
 RATE_HZ = 500.0
-START_UP = 60.0  # s that processes and discovery may take on a busy machine
-SLOWEST = 8.0  # s that a lock-step run may take per simulated s
 
 
 @dataclass(frozen=True)
@@ -68,10 +67,12 @@ def run_experiment(run: Run, on_wait: Callable[[], None] = lambda: None) -> Reco
 
 
 def _carry_out(run: Run, on_wait: Callable[[], None], log: IO) -> None:
-    pace = SLOWEST if run.mode == 'lockstep' else 1.0
+    def progress() -> tuple[int, int]:
+        return os.fstat(log.fileno()).st_size, _size(run.bag)
+
     try:
         with supervised(experiment_nodes(run), log) as supervisor:
-            status = supervisor.wait('simulation_node', START_UP + pace * run.length, on_wait)
+            status = supervisor.wait('simulation_node', PATIENCE, on_wait, progress)
             statuses = supervisor.end()
     except (ProcessDied, TimeoutError) as error:
         raise ExperimentError(str(error)) from None
@@ -80,6 +81,15 @@ def _carry_out(run: Run, on_wait: Callable[[], None], log: IO) -> None:
     for name, status in statuses.items():
         if status != 0:
             raise ExperimentError(f'{name} ended with status {status}')
+
+
+def _size(bag: Path) -> int:
+    """Bytes in the files of a bag, which may be on their way."""
+    try:
+        with os.scandir(bag) as entries:
+            return sum(entry.stat().st_size for entry in entries)
+    except FileNotFoundError:
+        return 0
 
 
 def check_counts(run: Run) -> dict[str, int]:

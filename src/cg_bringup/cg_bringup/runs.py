@@ -17,6 +17,8 @@ from cg_sysid.experiments import Experiment, ExperimentError
 
 MODES = ('lockstep', 'real_time')
 NOMINAL_MODEL = 'compass_gait_mit'
+PATIENCE = 60.0  # s without progress; on a busy machine processes take that long to start
+PEERS = 45.0  # s by which the nodes of a run may start apart
 ENDING = 5.0  # s that a node has to end in when it is told to
 CLOSING = 120.0  # s that the recorder may take to close its bag
 
@@ -99,6 +101,7 @@ def experiment_nodes(run: Run) -> dict[str, NodeOf]:
         'initial_state': list(experiment.initial_state),
         'duration': run.length,
         'recorders': 1,
+        'peer_timeout': PEERS,
         'experiment': experiment.name,
         'exit_when_done': True,
     }

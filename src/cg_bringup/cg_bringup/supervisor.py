@@ -89,14 +89,19 @@ class Supervisor:
             self.stop.check()
 
     def wait(
-        self, name: str, patience: float = float('inf'), on_wait: Callable[[], None] = lambda: None
+        self,
+        name: str,
+        patience: float = float('inf'),
+        on_wait: Callable[[], None] = lambda: None,
+        progress: Callable[[], object] = lambda: None,
     ) -> int:
         """Exit status of a process, when it has ended.
 
         Args:
             name: Which one.
-            patience: Longest wait in s.
+            patience: Longest wait in s without progress.
             on_wait: Called some times a second meanwhile.
+            progress: Gives something else whenever there is progress.
 
         Raises:
             ProcessDied: Another one ended before it.
@@ -104,16 +109,20 @@ class Supervisor:
             TimeoutError: Patience is over.
         """
         deadline = time.monotonic() + patience
+        reached = progress()
         awaited = self.processes[name]
         while awaited.poll() is None:
             self.stop.check()
             on_wait()
+            now_at = progress()
+            if now_at != reached:
+                reached, deadline = now_at, time.monotonic() + patience
             for other, process in self.processes.items():
                 # The awaited one may have ended between the two looks, and the others after it.
                 if process.poll() is not None and awaited.poll() is None:
                     raise ProcessDied(other, process.returncode)
             if time.monotonic() > deadline:
-                raise TimeoutError(f'{name} has not ended {patience:.0f} s after the start')
+                raise TimeoutError(f'no progress for {patience:g} s; {name} has not ended')
             time.sleep(POLL)
         return awaited.returncode
 

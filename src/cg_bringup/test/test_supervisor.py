@@ -89,6 +89,17 @@ def test_patience_ends(module):
     assert gone(supervisor)
 
 
+def test_patience_begins_anew_with_progress(module):
+    modules = {'machine': module('obedient', 'machine')}
+    looks = iter([*range(50), *[50] * 1000])
+    begin = time.monotonic()
+    with pytest.raises(TimeoutError, match=r'no progress for 0\.3 s; machine has not ended'):
+        with Supervisor(modules) as supervisor:
+            supervisor.wait('machine', 0.3, progress=lambda: next(looks))
+    # Fifty looks, 0.02 s apart, and patience after the last of them.
+    assert time.monotonic() - begin > 50 * 0.02 + 0.3
+
+
 def test_who_does_not_end_in_its_time_is_killed(module):
     stubborn = module('stubborn', 'machine')
     with Supervisor({'machine': stubborn}, ending={'machine': 0.2}) as supervisor:

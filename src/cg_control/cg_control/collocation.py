@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import brentq
+import scipy
 
 from cg_control.friction import (
     compensated,
@@ -315,7 +314,7 @@ def _with_friction(phase: Phase, model: Model, limit: float) -> Phase:
         if effect.friction and effect.friction != 'dry':
             model = model.without_effect(effect.label)
     taken, p = friction_torque(model), friction_parameters(model)
-    cubic = CubicHermiteSpline(phase.time, phase.states, phase.rates)
+    cubic = scipy.interpolate.CubicHermiteSpline(phase.time, phase.states, phase.rates)
 
     def slip(t):
         states = cubic(t)
@@ -331,7 +330,7 @@ def _with_friction(phase: Phase, model: Model, limit: float) -> Phase:
     for k in np.flatnonzero(rate[:-1] * rate[1:] < 0):
         first, last = time[k], time[k + 1]
         half = TURNING * (last - first) / abs(rate[k + 1] - rate[k])
-        inside, turn = (last - first) / 1000, brentq(slip, first, last)
+        inside, turn = (last - first) / 1000, scipy.optimize.brentq(slip, first, last)
         more += [t for t in (turn - half, turn + half) if first + inside < t < last - inside]
     time = np.union1d(time, more)
     states = cubic(time)

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import CompiledModel, compile_model
@@ -255,6 +255,7 @@ class Walker:
         self.tangent = math.tan(options.slope)
         self.step = min(options.step, *(c.largest_step for c in self.compiled.values()))
         self.delay = self.compiled['inner'].delays(self.p)[0]
+        self._root = scipy.optimize.brentq  # loaded now: no landing must wait for it
         self.events: list[Event] = []
         self.scuffed = False
         self.free: dict[str, FreeFoot] = {}
@@ -414,7 +415,7 @@ class Walker:
                 found.append((0.0, kind))
                 continue
             if value(first) > 0 >= value(y):
-                part = brentq(lambda s, value=value: value(after(s)), early, h, xtol=INSTANT)
+                part = self._root(lambda s, value=value: value(after(s)), early, h, xtol=INSTANT)
                 found.append((part, kind))
         nx = len(x)
         for part, kind in sorted(found):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from cg_dynamics.assemble import parameter_vector, stamped
 from cg_dynamics.compiled import compile_model
@@ -80,6 +80,8 @@ class Plant:
         self._walks = isinstance(model.mechanism, CompassGait) and not (
             setup.on_blocks or setup.springs or setup.fixture != 'none'
         )
+        if self._walks:
+            self._root = scipy.optimize.brentq  # loaded now: no landing must wait for it
         self.sample_ns = round(sample_time * 1e9)
         self._compiled = compile_model(model, setup)
         self._p = parameter_vector(model, setup)
@@ -176,7 +178,7 @@ class Plant:
             self._compiled.advance(x, u, self._p, part / steps, steps)
             return x
 
-        instant = brentq(lambda part: self._height(after(part)), 0.0, duration, xtol=INSTANT)
+        instant = self._root(lambda part: self._height(after(part)), 0.0, duration, xtol=INSTANT)
         x = after(instant)
         reach, _ = swing_foot(x, self.stance, self.model.values['leg_length'])
         if reach <= self._minimum_step:

@@ -11,7 +11,7 @@ hip angle is differentiated, as on a robot whose IMU tells the rate of one leg.
 import math
 
 import numpy as np
-from scipy.signal import cheby1
+import scipy
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -40,7 +40,9 @@ class Chebyshev:
 
     def __init__(self, cutoff_hz: float, value: np.ndarray, sample_time: float):
         self.sample_time = sample_time
-        self.sections = cheby1(ORDER, RIPPLE_DB, cutoff_hz, fs=1.0 / sample_time, output='sos')
+        self.sections = scipy.signal.cheby1(
+            ORDER, RIPPLE_DB, cutoff_hz, fs=1.0 / sample_time, output='sos'
+        )
         self.last = np.array(value, float)
         self.states = np.zeros((len(self.sections), 2, len(self.last)))
         level = self.last

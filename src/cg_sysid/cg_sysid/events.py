@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import find_peaks
+import scipy
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
@@ -175,7 +175,7 @@ def _small_events(
         own_g = g[m2] - h[m2, :m2] @ np.linalg.lstsq(h[:m2, :m2], g[:m2], rcond=None)[0]
         if own_h > 1e-9 * h[m2, m2]:
             gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
-    peaks, _ = find_peaks(np.concatenate([[0.0], gains, [0.0]]))
+    peaks, _ = scipy.signal.find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
     return [np.array([sizes[k], trial.since + grid[k]]) for k in order[:FOLLOWED]]
 

@@ -25,9 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import yaml
-from scipy.optimize import least_squares
-from scipy.signal import butter, csd, lfilter, sosfilt, welch
 
 from cg_description.model_file import write_atomically
 from cg_dynamics.linearise import linearise, without_dry_friction
@@ -128,9 +127,9 @@ def response(record: Record, channel: str, window: float = WINDOW) -> Response:
     if not np.any(u):
         raise ValueError(f'record {record.name!r} has no torque; there is no response')
     given: dict[str, Any] = {'fs': 1.0 / step, 'nperseg': n, 'detrend': 'linear'}
-    frequency, S_uu = welch(u, **given)
-    _, S_yy = welch(y, **given)
-    _, S_uy = csd(u, y, **given)
+    frequency, S_uu = scipy.signal.welch(u, **given)
+    _, S_yy = scipy.signal.welch(y, **given)
+    _, S_uy = scipy.signal.csd(u, y, **given)
     windows = 2 * len(u) // n - 1
     # Half-overlapping Hann windows are worth 0.95 of as many independent ones (Welch, 1967).
     averages = max(1.0, 0.95 * windows)
@@ -179,7 +178,7 @@ def resonance(path: Response, band: tuple[float, float] = BAND) -> Resonance | N
     start = np.array([2 * np.pi * f[top], 0.05, 0.002, 0.0, sign * float(np.median(below))])
     low = [2 * np.pi * band[0], 1e-3, 0.0, -np.inf, -np.inf]
     high = [2 * np.pi * band[1], 1.0, 0.05, np.inf, np.inf]
-    found = least_squares(
+    found = scipy.optimize.least_squares(
         error, start, bounds=(low, high), x_scale=np.maximum(np.abs(start), 1e-3), loss='soft_l1'
     )
     misfit = max(1.0, found.cost / len(f))
@@ -253,10 +252,10 @@ def magnitude_trace(
     Returns:
         Amplitude of what a sine would need for that mean magnitude, shape (n,).
     """
-    sections = butter(4, high_pass, 'highpass', fs=1.0 / sample_time, output='sos')
-    rectified = np.abs(sosfilt(sections, signal - signal[0]))
-    b, a = butter(1, low_pass, fs=1.0 / sample_time)
-    return lfilter(b, a, rectified) * np.pi / 2
+    sections = scipy.signal.butter(4, high_pass, 'highpass', fs=1.0 / sample_time, output='sos')
+    rectified = np.abs(scipy.signal.sosfilt(sections, signal - signal[0]))
+    b, a = scipy.signal.butter(1, low_pass, fs=1.0 / sample_time)
+    return scipy.signal.lfilter(b, a, rectified) * np.pi / 2
 
 
 def analyse(record: Record) -> tuple[list[Response], dict[str, Resonance | None]]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from cg_sysid.curves import Curve
 
@@ -72,7 +72,7 @@ def _pieces(curve: Curve, channel: int, unit: str) -> tuple[Any, ...] | None:
     if len(grid) < 3 * window:
         return None
     order = 1 if unit.endswith('/s') else 2
-    acceleration = savgol_filter(error, window, 3, deriv=order, delta=step)
+    acceleration = scipy.signal.savgol_filter(error, window, 3, deriv=order, delta=step)
     inner = slice(window, -window)
     power = np.abs(np.fft.rfft(error * np.hanning(len(error)))) ** 2
     share = np.cumsum(power) / power.sum() if power.sum() > 0 else np.ones(len(power))

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import OptimizeResult, minimize
+import scipy
 
 from cg_dynamics.model import Model
 from cg_sysid.identify import Fit, Progress, score
@@ -118,14 +118,14 @@ def _motions(model: Model, trials: Sequence[Trial]) -> list[np.ndarray]:
         return [trial.motion for trial in trials]
 
 
-def _search(cost: '_Cost', start: np.ndarray, evaluations: int) -> OptimizeResult:
+def _search(cost: '_Cost', start: np.ndarray, evaluations: int) -> 'scipy.optimize.OptimizeResult':
     simplex = np.tile(start, (len(start) + 1, 1))
     for j, value in enumerate(start):
         simplex[j + 1, j] = value * (1 + FIRST_SIMPLEX) if value else FIRST_AT_ZERO
     # Relative to each start, or else the smallest lump would never be resolved.
     scale = np.where(start != 0, np.abs(start), 1.0)
     return _unscaled(
-        minimize(
+        scipy.optimize.minimize(
             lambda relative: cost(relative * scale),
             start / scale,
             method='Nelder-Mead',
@@ -141,7 +141,9 @@ def _search(cost: '_Cost', start: np.ndarray, evaluations: int) -> OptimizeResul
     )
 
 
-def _unscaled(found: OptimizeResult, scale: np.ndarray) -> OptimizeResult:
+def _unscaled(
+    found: 'scipy.optimize.OptimizeResult', scale: np.ndarray
+) -> 'scipy.optimize.OptimizeResult':
     found.x = found.x * scale
     return found
 

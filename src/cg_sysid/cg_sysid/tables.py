@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy
 
 from cg_description.reading import JSON_LOG, parse_json, read_text, shown
 from cg_description.schema import ListOf, Number, meant

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.signal import welch
+import scipy
 
 from cg_sysid.curves import Curve
 from cg_sysid.faults import FaultSignal
@@ -118,7 +118,7 @@ def spectra(curves: Sequence[Curve], channel: int, sigma: float | None) -> Facts
     sums = np.zeros((2, length // 2 + 1))
     for _, before, after in regular:
         for row, signal in zip(sums, (before, after), strict=True):
-            row += welch(signal, 1 / step, nperseg=length, detrend=False)[1]
+            row += scipy.signal.welch(signal, 1 / step, nperseg=length, detrend=False)[1]
     frequency = np.fft.rfftfreq(length, step)
     density = sums / len(regular)
     groups = np.unique(np.geomspace(1, length // 2, FREQUENCIES).astype(int))
