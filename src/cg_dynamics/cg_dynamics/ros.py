@@ -12,8 +12,10 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
   be due without a pause has `eagerness`, the messages that it takes from one to the next.
 """
 
+import contextlib
 import dataclasses
 import inspect
+import os
 import sys
 import time
 import typing
@@ -186,7 +188,10 @@ class Throttled:
 
 
 def run(
-    make_node: Callable[[], Node], settings: type[Settings], args: list[str] | None = None
+    make_node: Callable[[], Node],
+    settings: type[Settings],
+    args: list[str] | None = None,
+    niceness: int = 0,
 ) -> int:
     """Make a node and spin it until it is told to stop (stop_request.py) or has `finished`.
 
@@ -194,6 +199,8 @@ def run(
         make_node: The class of the node.
         settings: What it declares, for `--help`.
         args: Of the command line; those of this process if None.
+        niceness: Of this process from now on, 0 to keep what it has. An ordinary user may not
+            lower it; then it stays.
 
     Returns:
         Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for arguments
@@ -213,6 +220,10 @@ def run(
         return 2
     # Until the node stands it has sent nothing: there is nothing that it must leave in order.
     end_at_once()
+    if niceness:
+        # Before anything starts a thread: threads inherit it.
+        with contextlib.suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, 0, niceness)
     end_with_parent()
     # rclpy's own handlers would shut the context down before the node can send its last torque.
     try:

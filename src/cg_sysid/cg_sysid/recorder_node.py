@@ -7,7 +7,6 @@ in    the sensor and torque topics of `mechanism`, /experiment, and those of `al
 out   /recorder/progress
 """
 
-import contextlib
 import functools
 import importlib
 import os
@@ -234,10 +233,7 @@ def qos_entry(profile: QoSProfile) -> dict:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_sysid recorder_node`."""
-    # Before anything starts a thread: threads inherit it. An ordinary user may not; so be it.
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-    return run(RecorderNode, RecorderSettings, args)
+    return run(RecorderNode, RecorderSettings, args, NICENESS)
 
 
 if __name__ == '__main__':
