@@ -1,4 +1,4 @@
-"""Tests that keep deadlines run alone, though others run side by side in several processes."""
+"""Tests in several processes: those that keep deadlines run alone, and the longest ones begin."""
 
 import fcntl
 from pathlib import Path
@@ -7,6 +7,16 @@ import pytest
 
 # Two files of this workspace that surely exist; locks do not touch them.
 _ROOM, _DOOR = Path(__file__), Path(__file__).with_name('pyproject.toml')
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Those that run alone first, then the slow ones.
+
+    Each process takes the next test of this order (colcon_defaults.yaml). So nobody waits in front
+    of a test that runs alone until a slow one has ended, and none is left with a slow one at last.
+    """
+    items.sort(key=lambda item: [item.get_closest_marker(m) is None for m in ('alone', 'slow')])
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

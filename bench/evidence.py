@@ -40,7 +40,8 @@ def main() -> int:
         report = Path(folder) / 'report.xml'
         status = subprocess.call(
             [
-                *(sys.executable, '-m', 'pytest', '-q', '-n', 'logical', '--dist', 'worksteal'),
+                *(sys.executable, '-m', 'pytest', '-q', '-n', 'logical'),
+                *('--dist', 'load', '--maxschedchunk', '1'),
                 *('-m', 'evidence', f'--junitxml={report}'),
                 *(str(ROOT / 'src' / package) for package in ('cg_sysid', 'cg_bringup')),
             ],

@@ -68,13 +68,16 @@ def record_programme(
     return bags
 
 
-def diagnose(console: Console, nominal: Path, bags: list[Path], out: Path) -> dict[str, Any]:
+def diagnose(
+    console: Console, nominal: Path, bags: list[Path], out: Path, candidates: str = ''
+) -> dict[str, Any]:
     """Run the analysis in a process of its own, which says what it finds; return that.
 
     Raises:
         ExperimentError: It failed.
     """
     analysis = ['cg_sysid.diagnose_cli', '--model', str(nominal), '--out', str(out)]
+    analysis += ['--effects', candidates] if candidates else []
     console.print('[bold]Diagnosing[/] from these bags and the nominal model, nothing else')
     start = time.monotonic()
     with Supervisor({'analysis': [*analysis, *map(str, bags)]}) as supervisor:
@@ -104,9 +107,22 @@ def reveal(console: Console, nominal: Model, hidden: Hidden) -> None:
 
 
 def run_demo(
-    effect: str | None, seed: int, out: Path, duration: float, console: Console
+    effect: str | None,
+    seed: int,
+    out: Path,
+    duration: float,
+    console: Console,
+    candidates: str = '',
 ) -> dict[str, Any]:
     """The whole demonstration; returns the diagnosis.
+
+    Args:
+        effect: To hide; None draws one.
+        seed: Of everything that is drawn.
+        out: Directory for bags and report.
+        duration: Of each record in s.
+        console: Takes what is said.
+        candidates: Effects that the analysis tries, with commas; empty for the whole library.
 
     Raises:
         ValueError: Something did not go through; the message says what.
@@ -124,7 +140,7 @@ def run_demo(
         machine = Path(directory) / 'machine.yaml'
         hidden.model.save(machine)
         bags = record_programme(console, machine, nominal_path, out / 'bags', seed, duration)
-        found = diagnose(console, nominal_path, bags, out)
+        found = diagnose(console, nominal_path, bags, out, candidates)
         shutil.copy(machine, out / 'hidden_machine.yaml')
     reveal(console, robot, hidden)
     console.print(f'\nReport: {out / "report.html"}\nModel:  {out / "model.yaml"}')
@@ -141,6 +157,9 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument(
         '--duration', type=float, default=DURATION, help=f'of each record in s [{DURATION:g}]'
     )
+    parser.add_argument(
+        '--candidates', default='', help='effects that the analysis tries [the whole library]'
+    )
     options = parser.parse_args(args)
     seed = time.time_ns() % 10000 if options.seed is None else options.seed
     out = options.out or Path(f'demo_{seed}')
@@ -148,7 +167,9 @@ def main(args: list[str] | None = None) -> int:
     console.print(f'[bold]Demonstration[/], seed {seed}: a machine with a secret')
     try:
         with stopped_by_signals():
-            run_demo(options.effect, seed, out, options.duration, console)
+            run_demo(
+                options.effect, seed, out, options.duration, console, options.candidates
+            )
     except (ValueError, RuntimeError, OSError) as error:
         console.print(f'error: {error}', markup=False, style='red')
         return 1

@@ -23,8 +23,6 @@ from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import to_nanoseconds  # noqa: E402
 from cg_sysid.experiments import load_experiment  # noqa: E402
 
-pytestmark = pytest.mark.alone
-
 PATIENCE = 60.0  # s for start-up on a busy machine
 ENOUGH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 STALE_NS = 20_000_000
@@ -91,6 +89,7 @@ def loop(tmp_path):
         rclpy.try_shutdown()
 
 
+@pytest.mark.slow
 def test_lock_step_balances_and_repeats_to_the_bit(loop):
     torques = []
     for _ in range(2):
@@ -111,6 +110,7 @@ def test_lock_step_balances_and_repeats_to_the_bit(loop):
     assert max(abs(torques[0][t]) for t in both) > 1.0
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize(
     ('victim', 'by'),
     [
@@ -167,6 +167,7 @@ def changes(run, count):
     return run.reports[1:before], run.reports[before:]
 
 
+@pytest.mark.slow
 def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
     run = loop(mode='lockstep', stance='inner', lean=0.03)
     _, reports = changes(run, 200)
@@ -177,6 +178,7 @@ def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
     assert max(abs(state.position[0]) for state in run.states[500:]) < 0.1
 
 
+@pytest.mark.alone
 @pytest.mark.evidence
 def test_two_hundred_changes_of_a_weight_make_no_answer_late(loop):
     """By the clock on the wall, which shows what else the machine has to do.

@@ -55,6 +55,7 @@ def models(robot, tmp_path_factory):
     return {'nominal': nominal, 'anew': found.baseline.model, 'extended': Model.load(path)}
 
 
+@pytest.mark.slow
 def test_the_extended_model_makes_the_observer_better(robot, models):
     setup = load_experiment('spring_stabilised_inner').setup
     signal = make_signal(ExcitationSettings(amplitude=5.0, duration=DURATION, seed=5))

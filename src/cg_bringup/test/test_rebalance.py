@@ -19,8 +19,6 @@ from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_estimation.observer_node import ObserverNode  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
 
-pytestmark = pytest.mark.alone
-
 NODES = {
     'observer': ObserverNode,
     'trajectory_server': TrajectoryServerNode,

@@ -25,6 +25,7 @@ def _record(machine, name, seed, duration, excitation=None):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_proposed_experiment_settles_what_is_ambiguous(model_file):
     nominal = Model.load(model_file)
     machine = nominal.with_values({'c1': 1.1 * nominal.values['c1']})

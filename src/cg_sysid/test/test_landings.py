@@ -185,6 +185,7 @@ def test_too_few_landings_are_not_judged():
 LUMPS = (('c1', 1.12), ('c2', 0.9), ('c4', 0.88), ('c5', 1.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'ground',
     [(), pytest.param(BOUNCY, marks=pytest.mark.evidence), SLIPPERY],
@@ -262,6 +263,7 @@ def in_mujoco(values, seed, friction):
                   'compass_gait', Setup(stance=stance))  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('friction', [pytest.param(2.0, marks=pytest.mark.evidence), 0.35])
 def test_the_ground_of_another_engine_is_named(friction):
     pytest.importorskip('mujoco', reason='MuJoCo is not installed')

@@ -57,6 +57,7 @@ def nominal(model_file):
     return Model.load(model_file)
 
 
+@pytest.mark.slow
 def test_small_faults_alone_are_consistent(nominal):
     machine = _with_small_faults(nominal.with_values({'c4': 1.08 * nominal.values['c4']}))
     found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
@@ -68,6 +69,7 @@ def test_small_faults_alone_are_consistent(nominal):
     assert identified == pytest.approx(0.001, rel=0.05)  # a quarter of a sample
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('effect', 'values'),
     [
@@ -91,6 +93,7 @@ def test_a_cause_is_named_among_small_faults(nominal, effect, values):
         assert abs(value - true) < 4 * sigma + 5e-3 * abs(true)
 
 
+@pytest.mark.slow
 def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
     """Together they come to the noise, and no cause without them does."""
     machine = nominal.with_effect('actuator_delay', delay=0.001)
@@ -105,6 +108,7 @@ def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
     assert identified.get('imu_offset.offset', 0.0) == pytest.approx(0.0, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_what_hides_behind_small_faults_and_is_small_itself_is_no_cause(nominal):
     machine = nominal.with_effect('actuator_delay', delay=0.001)
     machine = machine.with_effect('quadratic_friction', coefficient=0.006)
@@ -134,6 +138,7 @@ def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
     assert found.causes[0].proposals[0].evidence > 20
 
 
+@pytest.mark.slow
 def test_what_small_faults_take_a_part_of_is_not_small_itself(nominal):
     """Of a tether two springs may be any part that their bounds allow: its force is uncertain."""
     records = _records(nominal.with_effect('tether_force', force=5.0))
@@ -156,6 +161,7 @@ def test_springs_that_do_not_conspire_are_no_tether(nominal):
     assert (found.verdict, found.causes) == ('consistent', ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('effect', 'values', 'shape', 'rival'),
     [

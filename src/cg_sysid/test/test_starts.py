@@ -116,7 +116,8 @@ def _slow_sweep(machine, k):
         ('joint_flexibility', {'stiffness': 300.0, 'rotor_inertia': 0.15, 'damping': 0.4}),
         pytest.param('backlash', {'gap': 0.007, 'rotor_inertia': 0.14},
                      marks=pytest.mark.evidence),
-        ('backlash', {'gap': 0.058, 'rotor_inertia': 0.06}),
+        pytest.param('backlash', {'gap': 0.058, 'rotor_inertia': 0.06},
+                     marks=pytest.mark.evidence),
     ],
 )
 def test_found_where_the_first_seconds_mislead(model_file, effect, values):

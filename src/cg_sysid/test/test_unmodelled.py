@@ -51,6 +51,7 @@ OTHERS = (
     ],
     ids=lambda c: c.hidden.name,
 )
+@pytest.mark.slow
 def test_unlisted_effect_is_described(nominal, case):
     # Gravity in a gyroscope is small beside its noise: its shape takes all that the bench records.
     long = case.hidden is TiltedGyro
@@ -77,10 +78,11 @@ def test_unlisted_effect_is_described(nominal, case):
     assert all(name in answer.summary for name in case.listed)
 
 
+@pytest.mark.slow
 def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
-    made = records(hide(nominal, case.hidden))
+    made = records(hide(nominal, case.hidden), duration=SHORT)
     answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
@@ -107,6 +109,7 @@ def test_described_where_a_sensor_was_not_recorded(nominal):
     assert (answer.unmodelled.where, answer.unmodelled.effect.follows) == ('joint', 'angle:hip')
 
 
+@pytest.mark.slow
 def test_short_records_are_not_explained_by_pushes_of_their_own(nominal):
     # Two values more for each half second match it better whatever is wrong, held out or not.
     short = [part for r in records(hide(nominal, SoftStop)) for part in r.segments(0.6)]
