@@ -112,7 +112,8 @@ def test_described_where_a_sensor_was_not_recorded(nominal):
 @pytest.mark.slow
 def test_short_records_are_not_explained_by_pushes_of_their_own(nominal):
     # Two values more for each half second match it better whatever is wrong, held out or not.
-    short = [part for r in records(hide(nominal, SoftStop)) for part in r.segments(0.6)]
+    whole = records(hide(nominal, SoftStop), duration=SHORT)
+    short = [part for record in whole for part in record.segments(0.6)]
     answer = diagnose(nominal, short, Options(effects=('external_push',), workers=1))
     assert not answer.causes, answer.summary
     (tried,) = answer.rounds[0].candidates
