@@ -15,11 +15,13 @@ RIVALS = 'torque_constant,torque_bias,actuator_delay,encoder_scale'
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    'candidates', [RIVALS, pytest.param('', marks=pytest.mark.evidence)], ids=['rivals', 'library']
+    ('candidates', 'duration'),
+    [(RIVALS, 3.0), pytest.param('', 6.0, marks=pytest.mark.evidence)],
+    ids=['rivals', 'library'],
 )
-def test_a_hidden_torque_constant_is_found(candidates, tmp_path):
+def test_a_hidden_torque_constant_is_found(candidates, duration, tmp_path):
     console = Console(record=True, width=120)
-    found = run_demo('torque_constant', 1, tmp_path / 'demo', 6.0, console, candidates)
+    found = run_demo('torque_constant', 1, tmp_path / 'demo', duration, console, candidates)
     assert found['verdict'] in ('explained', 'ambiguous')
     # An ambiguous answer names the truth among its causes or their rivals.
     assert 'torque_constant' in json.dumps(found['causes'])

@@ -65,6 +65,7 @@ def test_robot_steps_from_one_leg_to_the_other_and_stands(robot, first, friction
             state, stance = machine.plant.state, machine.plant.stance
             for node in nodes.values():
                 executor.remove_node(node)
+                getattr(node, 'close', lambda: None)()
                 node.destroy_node()
         finally:
             rclpy.try_shutdown()
