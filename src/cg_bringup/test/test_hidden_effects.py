@@ -115,7 +115,7 @@ def test_nothing_hidden_is_consistent(seed, tmp_path):
 @pytest.mark.parametrize(
     ('effect', 'programme'),
     [
-        ('external_push', SWINGS),
+        ('external_push', SPRINGS),
         ('friction_drift', SWINGS),
         ('imu_drift', SWINGS),
         ('tether_force', SPRINGS),

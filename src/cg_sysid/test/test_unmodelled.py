@@ -82,7 +82,7 @@ def test_unlisted_effect_is_described(nominal, case):
 def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
-    made = records(hide(nominal, case.hidden), duration=SHORT)
+    made = records(hide(nominal, case.hidden))
     answer = diagnose(nominal, made, Options(effects=case.listed, workers=1))
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
