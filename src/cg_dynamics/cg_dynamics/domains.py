@@ -2,39 +2,66 @@
 
 import contextlib
 import fcntl
-import itertools
 import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 DOMAINS = range(2, 100)  # beyond 101, DDS ports run into those that Linux hands out
-_turn = itertools.count(os.getpid())
+
+
+def _lock_file(domain: int) -> Path:
+    return Path(tempfile.gettempdir()) / f'ros_domain_{domain}.lock'
+
+
+def _let_go(domain: int) -> float:
+    """When the last holder of a domain let it go, in s since the epoch; 0 if nobody held it."""
+    try:
+        return _lock_file(domain).stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _take(domain: int, since: float) -> IO | None:
+    """The lock on a domain that nobody held since then; None if somebody does or did."""
+    try:
+        lock = _lock_file(domain).open('a')
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if since in (0.0, _let_go(domain)):
+            os.utime(lock.fileno())  # should this process be killed
+            return lock
+    except OSError:
+        pass
+    lock.close()
+    return None
 
 
 @contextlib.contextmanager
 def own_domain() -> Iterator[int]:
     """Hold a ROS_DOMAIN_ID that no other holder on this machine has, and set it.
 
-    A file lock per domain marks it as taken; the lock dies with the process.
+    A file lock per domain marks it as taken; the lock dies with the process. Of those that are
+    free it is the one that has rested longest, whoever held it: nodes that were killed stay on the
+    graph of their domain for some seconds.
     """
     before = os.environ.get('ROS_DOMAIN_ID')
-    first = next(_turn)  # the domain held last is still full of ghosts
-    for offset in range(len(DOMAINS)):
-        domain = DOMAINS[(first + offset) % len(DOMAINS)]
-        path = Path(tempfile.gettempdir()) / f'ros_domain_{domain}.lock'
-        with contextlib.suppress(OSError), path.open('a') as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            os.environ['ROS_DOMAIN_ID'] = str(domain)
-            try:
-                yield domain
-            finally:
-                if before is None:
-                    del os.environ['ROS_DOMAIN_ID']
-                else:
-                    os.environ['ROS_DOMAIN_ID'] = before
-            return
+    for since, domain in sorted((_let_go(domain), domain) for domain in DOMAINS):
+        lock = _take(domain, since)
+        if lock is None:
+            continue
+        os.environ['ROS_DOMAIN_ID'] = str(domain)
+        try:
+            yield domain
+        finally:
+            os.utime(lock.fileno())
+            lock.close()
+            if before is None:
+                del os.environ['ROS_DOMAIN_ID']
+            else:
+                os.environ['ROS_DOMAIN_ID'] = before
+        return
     raise RuntimeError(f'all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are taken')
