@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -15,15 +16,20 @@ def _lock_file(domain: int) -> Path:
     return Path(tempfile.gettempdir()) / f'ros_domain_{domain}.lock'
 
 
-def _let_go(domain: int) -> float:
-    """When the last holder of a domain let it go, in s since the epoch; 0 if nobody held it."""
+def _let_go(domain: int) -> int:
+    """When the last holder of a domain let it go, in ns since the epoch; 0 if nobody held it."""
     try:
-        return _lock_file(domain).stat().st_mtime
+        return _lock_file(domain).stat().st_mtime_ns
     except OSError:
-        return 0.0
+        return 0
 
 
-def _take(domain: int, since: float) -> IO | None:
+def _note(lock: IO) -> None:
+    now = time.time_ns()  # finer than the clock of the file system
+    os.utime(lock.fileno(), ns=(now, now))
+
+
+def _take(domain: int, since: int) -> IO | None:
     """The lock on a domain that nobody held since then; None if somebody does or did."""
     try:
         lock = _lock_file(domain).open('a')
@@ -31,8 +37,8 @@ def _take(domain: int, since: float) -> IO | None:
         return None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if since in (0.0, _let_go(domain)):
-            os.utime(lock.fileno())  # should this process be killed
+        if since in (0, _let_go(domain)):
+            _note(lock)  # should this process be killed
             return lock
     except OSError:
         pass
@@ -57,7 +63,7 @@ def own_domain() -> Iterator[int]:
         try:
             yield domain
         finally:
-            os.utime(lock.fileno())
+            _note(lock)
             lock.close()
             if before is None:
                 del os.environ['ROS_DOMAIN_ID']
