@@ -233,6 +233,14 @@ class BalanceController:
         self._torque = self._filtered = self._offset = 0.0
         self._law, self._last_ns = None, None
 
+    def take_over(self, torque: float) -> None:
+        """Take the robot over at the next step from a controller that asks for this torque, N m.
+
+        The difference dies out over `hand_over`, as with any other law.
+        """
+        self.stop()
+        self._torque = self._filtered = torque
+
     def step(self, stamp_ns: int, stance: str, x: np.ndarray) -> Command:
         """The torque for a state.
 

@@ -12,30 +12,28 @@ in    /state, /applied_torque
 out   /torque_command, /diagnostics
 """
 
-import collections
 import dataclasses
 import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from cg_control.answer_age import AnswerAges
 from cg_control.balance import BALANCING, WEIGHTS, BalanceSettings
 from cg_control.live_design import LiveDesign
+from cg_control.state_message import state_of
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_dynamics.rig import STANCES
 from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
 from cg_dynamics.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 GAP = 0.02  # s between states after which the one before is history
-ROTOR = 'hip_rotor'
 
 
 @dataclass(frozen=True)
@@ -85,9 +83,7 @@ class BalanceNode(Node):
         self.message.header.frame_id = 'hip'
         self._last_ns: int | None = None
         self._reason = 'no state yet'
-        self._ages: collections.deque[float] = collections.deque(maxlen=5000)
-        self._answered: collections.OrderedDict[int, float] = collections.OrderedDict()
-        self._late = 0
+        self._ages = AnswerAges()
         self._next_diagnosis = 0.0
         self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -117,12 +113,9 @@ class BalanceNode(Node):
         self._last_ns = stamp_ns
         if self.controller.settings is not self.declared.values:
             self.design.adopt(self.declared.values)
-        stance = message.header.frame_id.removesuffix('_foot')
         torque, self._reason = 0.0, ''
         try:
-            x = self._state_of(message)
-            if stance not in STANCES:
-                raise ValueError(f'frame_id is {message.header.frame_id!r}; no foot of this robot')
+            stance, x = state_of(message)
         except ValueError as error:
             self.controller.stop()
             self._reason = str(error)
@@ -131,39 +124,19 @@ class BalanceNode(Node):
             torque, self._reason = command.torque, command.reason
         self._send(stamp_ns, torque)
 
-    def _state_of(self, message: JointState) -> np.ndarray:
-        names = [*STANCES, *([ROTOR] if ROTOR in message.name else [])]
-        if len(message.position) != len(message.name) or len(message.velocity) != len(
-            message.name
-        ):
-            raise ValueError('state without as many positions and velocities as names')
-        try:
-            rows = [list(message.name).index(name) for name in names]
-        except ValueError:
-            raise ValueError(f'state of {list(message.name)}; expected {names}') from None
-        q = [message.position[row] for row in rows]
-        v = [message.velocity[row] for row in rows]
-        return np.array([*q[:2], *v[:2], *q[2:], *v[2:]])
-
     def _send(self, stamp_ns: int, torque: float) -> None:
         self.message.header.stamp = to_stamp(stamp_ns)
         self.message.effort = [torque if math.isfinite(torque) else 0.0]
         self.publisher.publish(self.message)
-        self._answered[stamp_ns] = self.message.effort[0]
-        while len(self._answered) > 20:
-            self._answered.popitem(last=False)
+        self._ages.sent(stamp_ns, self.message.effort[0])
 
     def on_applied(self, message: JointState) -> None:
         """Note how old the measurement was when its torque was latched."""
-        if len(message.effort) != 1:
-            return
-        latched_ns, torque = to_nanoseconds(message.header.stamp), message.effort[0]
-        answers = [stamp for stamp, sent in self._answered.items() if sent == torque]
-        # Equal torques (zero, the limit) do not tell which of them was latched.
-        if len(answers) == 1 and answers[0] <= latched_ns:
-            age = (latched_ns - answers[0]) * 1e-9
-            self._ages.append(age)
-            self._late += age > self.declared.values.deadline
+        if len(message.effort) == 1:
+            deadline = self.declared.values.deadline
+            self._ages.latched(
+                to_nanoseconds(message.header.stamp), message.effort[0], deadline
+            )
 
     def poll(self) -> float:
         """Take over what was sampled, say once a second how it goes."""
@@ -176,26 +149,15 @@ class BalanceNode(Node):
 
     def _publish_diagnostics(self) -> None:
         status = DiagnosticStatus(name='balance', hardware_id='torque path')
-        well = self.controller.mode == BALANCING and not self._late
+        well = self.controller.mode == BALANCING and not self._ages.missed
         status.level = DiagnosticStatus.OK if well else DiagnosticStatus.WARN
         status.message = self.controller.mode + (f': {self._reason}' if self._reason else '')
-        values = {
-            'falls': self.controller.falls,
-            'missed_deadlines': self._late,
-            'deadline_ms': f'{1e3 * self.declared.values.deadline:.3f}',
-        }
-        if self._ages:
-            ages = 1e3 * np.array(self._ages)
-            values |= {
-                'age_p50_ms': f'{np.percentile(ages, 50):.3f}',
-                'age_p99_ms': f'{np.percentile(ages, 99):.3f}',
-                'age_max_ms': f'{ages.max():.3f}',
-            }
+        values = {'falls': self.controller.falls}
+        values |= self._ages.figures(self.declared.values.deadline)
         status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = to_stamp(time.time_ns())
         self.diagnostics.publish(array)
-        self._late = 0
 
     def close(self) -> None:
         """Leave with zero torque, and no process behind."""

@@ -16,7 +16,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -27,10 +26,10 @@ from trajectory_msgs.msg import JointTrajectory
 from cg_control.balance import BALANCING, WEIGHTS
 from cg_control.execution import CAUGHT, TRACKING, ExecutionSettings, TrajectoryController
 from cg_control.live_design import LiveDesign
+from cg_control.state_message import state_of
 from cg_control.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_dynamics.rig import STANCES
 from cg_dynamics.ros import (
     LATCHED_QOS,
     SENSOR_QOS,
@@ -199,25 +198,6 @@ class TvlqrNode(Node):
         self.design.close()
         if self._last_ns is not None:
             self._send(self._last_ns, 0.0)
-
-
-def state_of(message: JointState) -> tuple[str, np.ndarray]:
-    """Stance leg and (q_inner, q_outer, rates) of a /state message.
-
-    Raises:
-        ValueError: naming what is missing.
-    """
-    stance = message.header.frame_id.removesuffix('_foot')
-    if stance not in STANCES:
-        raise ValueError(f'frame_id is {message.header.frame_id!r}; no foot of this robot')
-    names = list(message.name)
-    if len(message.position) != len(names) or len(message.velocity) != len(names):
-        raise ValueError('state without as many positions and velocities as names')
-    if any(leg not in names for leg in STANCES):
-        raise ValueError(f'state of {names}; expected {list(STANCES)}')
-    rows = [names.index(leg) for leg in STANCES]
-    q = [message.position[row] for row in rows]
-    return stance, np.array([*q, *(message.velocity[row] for row in rows)])
 
 
 def main(args: list[str] | None = None) -> int:

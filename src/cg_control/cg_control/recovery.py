@@ -1,0 +1,284 @@
+"""Following a tree live: recovery from wherever a funnel holds the robot, then balance.
+
+At every measurement, in this order:
+
+    1. In the goal region of the leg that stands the robot balances, and goes on balancing until
+       it is out of the balance controller's basin.                                      (HOME)
+    2. It follows its node as long as the funnel there holds it. It goes over to the node at
+       which its state is least deep, if it has left its funnel, or if it is so much less deep
+       there and home is not further.                                                    (SWITCH)
+    3. Outside every funnel there is no torque, until a funnel holds the state again.    (OUTSIDE)
+
+Nothing is planned meanwhile: what a push does to the state is answered by another node. A foot
+that lands where no impact was planned is a state like any other. *Hysteresis*: what the robot is
+in counts as larger by `hold`, and a rival must be less deep by `margin`, so that noise at the edge
+of a funnel, or between two nodes, changes nothing.
+"""
+
+import collections
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from cg_control.balance import BALANCING, IDLE, BalanceController, BalanceSettings, Command
+from cg_control.lookup import Claim, Lookup
+from cg_control.tracking import Tracker, TrackingSettings
+from cg_control.tree import Tree
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+from cg_dynamics.settings import setting
+
+FOLLOWING, OUTSIDE = 'following', 'outside'
+KEPT = 5000  # look-ups whose time is remembered
+
+
+@dataclass(frozen=True)
+class RecoverySettings(BalanceSettings):
+    """Parameters of the controller that follows a tree."""
+
+    fall_angle: float = setting(
+        0.55, 'lean of the stance leg beyond which no funnel is believed', unit='rad',
+        minimum=0.05, maximum=1.5, live=True,
+    )  # fmt: skip
+    remedy: str = setting(
+        'event', 'what is done about impacts off their time', choices=('event', 'phase'),
+        live=True,
+    )  # fmt: skip
+    pull: float = setting(
+        5.0, 'phase: rate at which the phase is drawn to the closest point', unit='1/s',
+        minimum=0.0, maximum=100.0, live=True,
+    )  # fmt: skip
+    fastest: float = setting(
+        2.0, 'phase: largest rate of the phase, and the inverse of the least', minimum=1.0,
+        maximum=10.0, live=True,
+    )  # fmt: skip
+    hold: float = setting(
+        2.0, 'depth at which the robot leaves the funnel or the basin that it is in; it enters '
+        'at 1', minimum=1.0, maximum=1e6, live=True,
+    )  # fmt: skip
+    margin: float = setting(
+        0.5, 'by how much less deep a state must be elsewhere for the robot to go over',
+        minimum=0.0, maximum=1e6, live=True,
+    )  # fmt: skip
+
+    @property
+    def tracking(self) -> TrackingSettings:
+        """Those of the law that follows."""
+        return TrackingSettings(remedy=self.remedy, pull=self.pull, fastest=self.fastest)
+
+
+@dataclass(frozen=True)
+class ReadyTree:
+    """A tree and what following it takes, made ahead: no answer to a state waits for it.
+
+    Attributes:
+        tree: The tree.
+        lookup: Of its funnels.
+        tracker: Of its nodes.
+    """
+
+    tree: Tree
+    lookup: Lookup
+    tracker: Tracker
+
+    @classmethod
+    def of(cls, tree: Tree, model: Model) -> 'ReadyTree':
+        """Make everything.
+
+        Raises:
+            TreeError: The tree was grown for another model.
+        """
+        tree.require_model(model)
+        nodes = tree.nodes
+        ready = cls(tree, Lookup(nodes), Tracker(nodes, model))
+        # Properties that are worked out once, when they are first asked for.
+        _ = nodes.costs, nodes.to_go, nodes.steps
+        return ready
+
+
+class TreeController:
+    """Brings a robot home along a tree. The same object runs in the node, benches and tests.
+
+    Args:
+        balance: Of both legs; engages in the goal regions of the tree.
+        model: The robot as it is known.
+        settings: May be replaced between steps by `adopt`; those of `balance` are its own.
+
+    Attributes:
+        mode: 'idle' (not armed, or no tree), 'balancing', 'following' or 'outside'.
+        node: That is followed, -1 while none is.
+        entered: Node at which it went over to where it is now, -1 while none is followed.
+        depth: Of the last state: in the basin while balancing, in the funnel otherwise, NaN
+            where none is said (an impact is due). Inside if 1 or less.
+        switches: How often the robot has gone over to another node while it followed one.
+        lookup_times: Of the last look-ups, s.
+    """
+
+    def __init__(self, balance: BalanceController, model: Model, settings: RecoverySettings):
+        self.balance, self.model, self.settings = balance, model, settings
+        self.mode, self.node, self.entered = IDLE, -1, -1
+        self.depth, self.switches = math.inf, 0
+        self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
+        self._ready: ReadyTree | None = None
+        self._stance, self._torque = '', 0.0
+
+    @property
+    def tree(self) -> Tree | None:
+        """What is followed."""
+        return self._ready.tree if self._ready else None
+
+    @property
+    def to_go(self) -> float:
+        """Nominal time until upright in s: 0 while balancing, infinite outside every funnel."""
+        if self.mode != FOLLOWING or self._ready is None:
+            return 0.0 if self.mode == BALANCING else math.inf
+        tracker = self._ready.tracker
+        return max(float(tracker.nodes.to_go[tracker.node]) - tracker.elapsed, 0.0)
+
+    @property
+    def branch(self) -> int:
+        """Number of the trajectory that is followed, -1 while none is."""
+        return -1 if self.node < 0 or self.tree is None else int(self.tree.nodes.branch[self.node])
+
+    def adopt(self, settings: RecoverySettings) -> None:
+        """New settings from the next step on."""
+        self.settings = settings
+        if self._ready is not None:
+            self._ready.tracker.settings = settings.tracking
+
+    def take(self, ready: ReadyTree | None) -> None:
+        """Follow another tree from the next step on, or none."""
+        self._ready = ready
+        if self.mode == FOLLOWING:
+            self._rest(IDLE)
+        if ready is not None:
+            ready.tracker.settings = self.settings.tracking
+
+    def interrupt(self) -> None:
+        """States were missing: what was known of the motion is void."""
+        self._rest(IDLE)
+
+    def step(self, stamp_ns: int, stance: str, x: np.ndarray) -> Command:
+        """The torque for a state; arguments as `BalanceController.step`."""
+        x = np.asarray(x, float)
+        landed, self._stance = stance != self._stance, stance
+        reason = self._doubt()
+        if reason:
+            self._rest(IDLE)
+            return Command(0.0, IDLE, reason)
+        reason = self._nowhere(stance, x)
+        if reason:
+            self._rest(OUTSIDE)
+            return Command(0.0, OUTSIDE, reason)
+        best = self._best(stance, x)
+        command = self._balanced(stamp_ns, stance, x, landed)
+        return command or self._followed(stamp_ns, stance, x, best)
+
+    def _doubt(self) -> str:
+        if not self.settings.armed:
+            return 'not armed'
+        return '' if self._ready else 'no tree'
+
+    def _nowhere(self, stance: str, x: np.ndarray) -> str:
+        """Why no funnel is asked."""
+        if stance not in STANCES:
+            return f'stance is {stance!r}; allowed are {", ".join(STANCES)}'
+        if not math.isfinite(x.sum()):
+            return 'the state is not finite'
+        standing = STANCES.index(stance)
+        lean, swing = x[standing], x[1 - standing]
+        if abs(lean) > self.settings.fall_angle or abs(swing) > self.settings.largest_swing:
+            return f'leaning by {lean:.3g} rad, swing leg at {swing:.3g} rad'
+        return ''
+
+    def _balanced(
+        self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool
+    ) -> Command | None:
+        """The balance controller's answer, where (HOME) gives it the robot."""
+        if self.mode == BALANCING and not landed:
+            depth = self._depth_in_basin(stance, x)
+            at_home = depth <= self.settings.hold
+        else:
+            depth = self._depth_in_goal(stance, x)
+            at_home = depth <= 1.0
+        if at_home:
+            if self.mode != BALANCING:
+                self.balance.take_over(self._torque)
+            command = self.balance.step(stamp_ns, stance, x)
+            if command.mode == BALANCING:
+                self.mode, self.depth, self._torque = BALANCING, depth, command.torque
+                self.node = self.entered = -1
+                return command
+        self.balance.stop()
+        return None
+
+    def _depth_in_goal(self, stance: str, x: np.ndarray) -> float:
+        assert self._ready is not None
+        form = self._ready.tree.goal[STANCES.index(stance)]
+        motion = x[: len(form)]
+        depth = float(motion @ form @ motion)
+        return depth if depth == depth else math.inf  # this leg is no goal
+
+    def _depth_in_basin(self, stance: str, x: np.ndarray) -> float:
+        """Squared, as a depth in a funnel is: both grow as a cost does."""
+        if self.balance.basins is None:
+            return self._depth_in_goal(stance, x)
+        return self.balance.basins[stance].depth(x) ** 2
+
+    def _followed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> Command:
+        """The torque of the node that is followed after (SWITCH)."""
+        assert self._ready is not None
+        tracker = self._ready.tracker
+        torque, here = 0.0, math.inf
+        if self.mode == FOLLOWING:
+            torque = tracker.torque(stamp_ns * 1e-9, stance, x)
+            here = self._depth_here(stance, x)
+        lost = here > self.settings.hold  # NaN, where none is said, is not
+        if lost and best.depth > 1.0:
+            self._rest(OUTSIDE)
+            self.depth = best.depth
+            return Command(0.0, OUTSIDE, f'outside every funnel: depth {best.depth:.3g}')
+        if lost or (best.depth < here - self.settings.margin and self._nearer(best.node)):
+            self.switches += self.mode == FOLLOWING
+            tracker.begin(best.node)
+            self.entered = best.node
+            torque, here = tracker.torque(stamp_ns * 1e-9, stance, x), best.depth
+        self.mode, self.node, self.depth = FOLLOWING, tracker.node, here
+        limit = self.balance.torque_limit
+        self._torque = min(max(torque, -limit), limit)
+        return Command(self._torque, FOLLOWING)
+
+    def _best(self, stance: str, x: np.ndarray) -> Claim:
+        assert self._ready is not None
+        began = time.perf_counter()
+        best = self._ready.lookup.best(STANCES.index(stance), x)
+        self.lookup_times.append(time.perf_counter() - began)
+        return best
+
+    def _depth_here(self, stance: str, x: np.ndarray) -> float:
+        """Depth in the funnel at the present point of the tree; NaN where there is none."""
+        assert self._ready is not None
+        tracker, nodes = self._ready.tracker, self._ready.tree.nodes
+        node = tracker.node
+        if tracker.left(stance):
+            return math.inf
+        rho = nodes.rho.item(node)
+        if rho == 0.0:
+            # An impact is due, or late: nothing is claimed until the foot has landed.
+            # Where the reference of a late impact ends, the plan does, too.
+            return math.inf if nodes.next.item(node) < 0 else math.nan
+        # At a root time stands still, whatever the clock says.
+        elapsed = 0.0 if tracker.done else tracker.elapsed
+        return max(nodes.cost_to_go(node, elapsed, x[: nodes.x0.shape[1]]), 0.0) / rho
+
+    def _nearer(self, node: int) -> bool:
+        assert self._ready is not None
+        return bool(self._ready.tree.nodes.to_go[node] <= self.to_go)
+
+    def _rest(self, mode: str) -> None:
+        """No torque from now on."""
+        self.balance.stop()
+        self.mode, self.depth, self._torque = mode, math.inf, 0.0
+        self.node = self.entered = -1

@@ -1,0 +1,172 @@
+"""ROS node of the tree server: it selects a tree, checks it, and shows what is done with it.
+
+`tree` selects, the name of one that comes along or a file; ~/load (std_srvs/Trigger) takes the file
+as it is now, after it was grown anew, and says whether it can be used. A tree that cannot be used,
+one of another model for instance, is an error in the log and in the answer of ~/load. The tree
+before stays selected.
+
+/tree/selected   path and SHA-256 of the file as JSON, latched: what the tree controller loads
+/tree/node       from the tree controller: the node that it went over to, -1 outside the tree
+/tree/branch     the way home from that node as JointTrajectory, latched; empty where there is none
+/tree/markers    the same as lines of hip and feet for RViz and Foxglove, latched; in the frame
+                 `world`, the foot that stands in its origin
+
+in    /tree/node
+out   /tree/selected, /tree/branch, /tree/markers
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from geometry_msgs.msg import Point
+from rclpy.node import Node
+from std_msgs.msg import ColorRGBA, Int32, String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from visualization_msgs.msg import Marker, MarkerArray
+
+from cg_control.tree import Tree
+from cg_control.tree_files import TreeSelection, tree_path
+from cg_control.way_home import WayHome
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run
+from cg_dynamics.settings import Settings, setting
+
+NOMINAL_MODEL = 'compass_gait_mit'
+FRAME = 'world'
+WIDTH = 0.01  # m, of a line
+# (red, green, blue) of each line; the legs as in the URDF.
+COLOURS = {
+    'hip': (0.2, 0.2, 0.2), 'inner_foot': (0.85, 0.45, 0.1), 'outer_foot': (0.1, 0.4, 0.75),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TreeServerSettings(Settings):
+    """Parameters of the tree server."""
+
+    model_file: str = setting(
+        '', 'model of the robot, a file or a name; empty for the nominal compass gait'
+    )
+    tree: str = setting(
+        'compass_gait_mit', 'what is selected: a tree that comes along, or a file', live=True
+    )
+
+
+class TreeServerNode(Node):
+    """Publishes /tree/selected."""
+
+    def __init__(self, **kwargs):
+        super().__init__('tree_server', **kwargs)
+        self.declared = DeclaredSettings(self, TreeServerSettings)
+        self.model = Model.load(self.declared.values.model_file or model_path(NOMINAL_MODEL))
+        self.tree: Tree | None = None
+        self.problem = 'nothing selected yet'
+        self._followed: TreeServerSettings | None = None
+        self.selected = self.create_publisher(String, '/tree/selected', LATCHED_QOS)
+        self.branch = self.create_publisher(JointTrajectory, '/tree/branch', LATCHED_QOS)
+        self.markers = self.create_publisher(MarkerArray, '/tree/markers', LATCHED_QOS)
+        self.create_subscription(Int32, '/tree/node', self.on_node, SENSOR_QOS)
+        self.create_service(Trigger, '~/load', self.on_load)
+        self.poll()
+
+    def poll(self) -> float:
+        """Follow the selection."""
+        if self._followed is not self.declared.values:
+            self._select()
+        return 0.1
+
+    def _select(self) -> None:
+        settings = self._followed = self.declared.values
+        try:
+            selection = TreeSelection.of(tree_path(settings.tree))
+            tree = selection.load(self.model)
+        except ValueError as error:
+            self.problem = str(error)
+            self.get_logger().error(self.problem)
+            return
+        self.tree, self.problem = tree, ''
+        self.selected.publish(String(data=selection.text()))
+        self.show(-1)
+        self.get_logger().info(
+            f'{settings.tree}: {len(tree.nodes)} nodes in {int(tree.nodes.branch.max())} branches '
+            f'to upright on the {" or ".join(tree.legs)} leg'
+        )
+
+    def on_load(self, request, response):
+        """Take the selected file as it is now."""
+        self._select()
+        response.success, response.message = not self.problem, self.problem
+        return response
+
+    def on_node(self, message: Int32) -> None:
+        """The controller went over to another node."""
+        self.show(message.data)
+
+    def show(self, node: int) -> None:
+        """Publish the way home from a node; an empty one where there is none."""
+        way = None
+        if self.tree is not None and 0 <= node < len(self.tree.nodes):
+            way = WayHome.along(self.tree.nodes, node)
+        self.branch.publish(joint_trajectory(way))
+        self.markers.publish(marker_array(way, self.model.values['leg_length']))
+
+
+def joint_trajectory(way: WayHome | None) -> JointTrajectory:
+    """The way home: docs/interfaces.md, "Trajectories"."""
+    message = JointTrajectory(joint_names=list(STANCES))
+    if way is None:
+        return message
+    message.header.frame_id = f'{STANCES[way.stance[0]]}_foot'
+    for t, x, dx, u in zip(way.time, way.states, way.rates, way.torque, strict=True):
+        seconds, rest = divmod(round(t * 1e9), 1_000_000_000)
+        message.points.append(
+            JointTrajectoryPoint(
+                positions=x[:2].tolist(),
+                velocities=x[2:4].tolist(),
+                accelerations=dx[2:4].tolist(),
+                effort=[float(u), -float(u)],
+                time_from_start=Duration(sec=seconds, nanosec=rest),
+            )
+        )
+    return message
+
+
+def marker_array(way: WayHome | None, leg_length: float) -> MarkerArray:
+    """Lines of hip and feet; where there is no way, what takes away those of before.
+
+    Args:
+        way: The way home.
+        leg_length: In m.
+    """
+    if way is None or len(way.nodes) < 2:
+        gone = Marker(action=Marker.DELETEALL)
+        gone.header.frame_id = FRAME
+        return MarkerArray(markers=[gone])
+    lines = way.points(leg_length)
+    return MarkerArray(markers=[
+        _line(number, name, points) for number, (name, points) in enumerate(lines.items())
+    ])  # fmt: skip
+
+
+def _line(number: int, name: str, points: np.ndarray) -> Marker:
+    line = Marker(ns=name, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
+    line.header.frame_id = FRAME
+    line.pose.orientation.w = 1.0
+    line.scale.x = WIDTH
+    red, green, blue = COLOURS[name]
+    line.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+    line.points = [Point(x=float(x), z=float(z)) for x, z in points]
+    return line
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_control tree_server_node`."""
+    return run(TreeServerNode, TreeServerSettings, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
