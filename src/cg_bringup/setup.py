@@ -43,6 +43,7 @@ setup(
         'console_scripts': [
             'balance = cg_bringup.balance_run:main',
             'rebalance = cg_bringup.rebalance_run:main',
+            'recover_balance = cg_bringup.recover_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
             'replay = cg_bringup.replay:main',

@@ -12,6 +12,8 @@ NODES = [
     'balance_node = cg_control.balance_node:main',
     'playback_node = cg_control.playback_node:main',
     'trajectory_server_node = cg_control.trajectory_server_node:main',
+    'tree_controller_node = cg_control.tree_controller_node:main',
+    'tree_server_node = cg_control.tree_server_node:main',
     'tvlqr_node = cg_control.tvlqr_node:main',
 ]
 
@@ -34,7 +36,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *shared('config', 'launch', 'models', 'rviz', 'layouts', 'urdf'),
+        *shared('config', 'launch', 'models', 'rviz', 'layouts', 'trees', 'urdf'),
     ],
     python_requires='>=3.10',
     install_requires=[
@@ -51,6 +53,7 @@ setup(
         'console_scripts': [
             *(NODES if find_spec('rclpy') else []),
             'cost_tuning = cg_control.cost_tuning:main',
+            'grow_tree = cg_control.grow_tree:main',
         ],
     },
 )

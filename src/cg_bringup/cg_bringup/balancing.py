@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cg_control.balance import BALANCING, BalanceController
+from cg_control.recovery import TreeController
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES
@@ -31,7 +32,7 @@ class BalanceRun:
         torque: What the drive latched, N m, shape (n,).
         readings: Channel -> what the sensors reported, shape (n,).
         engaged: Whether the controller was balancing, shape (n,).
-        standing: Index of the stance leg.
+        standing: Index of the stance leg, shape (n,).
     """
 
     time: np.ndarray
@@ -40,12 +41,12 @@ class BalanceRun:
     torque: np.ndarray
     readings: dict[str, np.ndarray]
     engaged: np.ndarray
-    standing: int
+    standing: np.ndarray
 
     @property
     def lean(self) -> np.ndarray:
         """Lean of the stance leg in rad, shape (n,)."""
-        return self.states[:, self.standing]
+        return self.states[np.arange(len(self.states)), self.standing]
 
     def upright(self, duration: float) -> bool:
         """True if the run lasted that many s, engaged to the end, and ends upright."""
@@ -60,7 +61,7 @@ class BalanceRun:
 def balance(
     plant: Plant,
     estimator: Estimator,
-    controller: BalanceController,
+    controller: BalanceController | TreeController,
     duration: float,
     pushes: Sequence[tuple[float, float]] = (),
 ) -> BalanceRun:
@@ -73,8 +74,6 @@ def balance(
         duration: In s.
         pushes: Instants in s and horizontal impulses in N s at the hip.
     """
-    stance = plant.setup.stance
-    standing = STANCES.index(stance)
     gate = TorqueGate(GateSettings(torque_limit=controller.torque_limit), ('hip',))
     rows: list[tuple] = []
     torque = 0.0
@@ -84,21 +83,25 @@ def balance(
             plant.push(hits[tick])
         measurement = plant.measure()
         now = measurement.time_ns
-        estimate = estimator.step(now, torque, measurement.outputs, stance)
+        standing = STANCES.index(plant.stance)
+        estimate = estimator.step(now, torque, measurement.outputs, plant.stance)
         command = controller.step(now, estimate.stance, estimate.x)
         gate.offer([command.torque], now, now)
         (torque,) = gate.torque(now).torque
         rows.append(
-            (now * 1e-9, plant.state, estimate.x, torque, measurement.outputs, controller.mode)
-        )
+            (
+                now * 1e-9, plant.state, estimate.x, torque, measurement.outputs,
+                controller.mode, standing,
+            )
+        )  # fmt: skip
         plant.latch(np.array([torque]))
         try:
             plant.advance()
         except SimulationError:
             break
-        if abs(plant.state[standing]) > FALLEN:
+        if abs(plant.state[STANCES.index(plant.stance)]) > FALLEN:
             break
-    time, states, estimates, torques, readings, modes = zip(*rows, strict=True)
+    time, states, estimates, torques, readings, modes, legs = zip(*rows, strict=True)
     return BalanceRun(
         np.array(time),
         np.array(states),
@@ -106,7 +109,7 @@ def balance(
         np.array(torques),
         {c: np.array([r[c] for r in readings]) for c in readings[0]},
         np.array([mode == BALANCING for mode in modes]),
-        standing,
+        np.array(legs),
     )
 
 

@@ -30,6 +30,8 @@ from launch_ros.actions import Node
 from cg_bringup.balance_run import MACHINE, verdict_of, with_outcome
 from cg_bringup.runs import NodeOf, parameter_file_text
 from cg_bringup.verdict import Verdict
+from cg_description.reading import parse_yaml
+from cg_description.schema import ListOf, Number
 from cg_dynamics.stop_request import ON_STDIN
 from cg_hardware.standing import Outcome
 
@@ -74,6 +76,11 @@ def number(given: Mapping[str, str], name: str, kind: Callable = float):
     except ValueError:
         what = 'a whole number' if kind is int else 'a number'
         raise ValueError(f'{name} is {given[name]!r}; {what} is needed') from None
+
+
+def pushes_of(text: str) -> list[float]:
+    """Instants and impulses of a list in YAML, `[t1, P1, t2, P2, ...]`."""
+    return ListOf(Number()).of(parse_yaml(text, 'pushes') or [], 'pushes')
 
 
 def node_actions(

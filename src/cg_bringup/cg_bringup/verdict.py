@@ -1,4 +1,4 @@
-"""Whether a run worked, in one line: what `balance` and `rebalance` end with."""
+"""Whether a run worked, in one line: what `balance` and its kin end with."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,6 +58,19 @@ def rebalance_verdict(outcome: Outcome, first: str, asked: bool = True) -> Verdi
     if not outcome.stepped_at:
         return Verdict(not asked, f'no step, upright throughout: {_length(outcome)}')
     return Verdict(False, f'{len(outcome.stepped_at)} steps instead of one{steps}')
+
+
+def recovery_verdict(outcome: Outcome, pushes: Sequence[float] = ()) -> Verdict:
+    """Of a robot that was to come home, by as many steps as it takes.
+
+    Args:
+        outcome: How it fared.
+        pushes: Instants in s and impulses in N s, in turn.
+    """
+    found = balance_verdict(outcome, pushes)
+    steps = ''.join(f', step at {t:.2f} s' for t in outcome.stepped_at)
+    line = found.line.replace('upright throughout', 'upright at the end', 1)
+    return Verdict(found.worked, f'{line}{steps}')
 
 
 def _stands(outcome: Outcome) -> bool:

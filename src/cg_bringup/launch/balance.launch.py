@@ -10,11 +10,9 @@ The same nodes as `ros2 run cg_bringup balance`. Tune them while they run:
 from launch import LaunchDescription
 
 from cg_bringup.balance_run import BalanceOptions, balance_nodes
-from cg_bringup.launching import description, node_actions, number
+from cg_bringup.launching import description, node_actions, number, pushes_of
 from cg_bringup.runs import MODES
 from cg_bringup.verdict import balance_verdict
-from cg_description.reading import parse_yaml
-from cg_description.schema import ListOf, Number
 from cg_dynamics.rig import STANCES
 
 DEFAULT = BalanceOptions()
@@ -30,11 +28,6 @@ ARGUMENTS = {
     'method': ('high_gain', 'of the observer', None),
     'epsilon': (str(DEFAULT.epsilon), 'time constant of the observer, s', None),
 }
-
-
-def pushes_of(text: str) -> list[float]:
-    """Instants and impulses of a list in YAML, `[t1, P1, t2, P2, ...]`."""
-    return ListOf(Number()).of(parse_yaml(text, 'pushes') or [], 'pushes')
 
 
 def start(given: dict[str, str]) -> list:

@@ -26,7 +26,7 @@ MAY_IMPORT = {
 }  # fmt: skip
 ROS = {
     'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
-    'std_msgs', 'std_srvs', 'trajectory_msgs',
+    'std_msgs', 'std_srvs', 'trajectory_msgs', 'visualization_msgs',
 }  # fmt: skip
 
 

@@ -42,6 +42,10 @@ class RecoverySettings(BalanceSettings):
         0.55, 'lean of the stance leg beyond which no funnel is believed', unit='rad',
         minimum=0.05, maximum=1.5, live=True,
     )  # fmt: skip
+    largest_swing: float = setting(
+        2.2, 'angle of the swing leg beyond which no funnel is believed', unit='rad',
+        minimum=0.1, maximum=3.1, live=True,
+    )  # fmt: skip
     remedy: str = setting(
         'event', 'what is done about impacts off their time', choices=('event', 'phase'),
         live=True,
@@ -55,11 +59,11 @@ class RecoverySettings(BalanceSettings):
         maximum=10.0, live=True,
     )  # fmt: skip
     hold: float = setting(
-        2.0, 'depth at which the robot leaves the funnel or the basin that it is in; it enters '
+        4.0, 'depth at which the robot leaves the funnel or the basin that it is in; it enters '
         'at 1', minimum=1.0, maximum=1e6, live=True,
     )  # fmt: skip
     margin: float = setting(
-        0.5, 'by how much less deep a state must be elsewhere for the robot to go over',
+        2.0, 'by how much less deep a state must be elsewhere for the robot to go over',
         minimum=0.0, maximum=1e6, live=True,
     )  # fmt: skip
 
@@ -128,6 +132,11 @@ class TreeController:
     def tree(self) -> Tree | None:
         """What is followed."""
         return self._ready.tree if self._ready else None
+
+    @property
+    def torque_limit(self) -> float:
+        """Largest torque commanded, N m."""
+        return self.balance.torque_limit
 
     @property
     def to_go(self) -> float:
@@ -246,7 +255,7 @@ class TreeController:
             self.entered = best.node
             torque, here = tracker.torque(stamp_ns * 1e-9, stance, x), best.depth
         self.mode, self.node, self.depth = FOLLOWING, tracker.node, here
-        limit = self.balance.torque_limit
+        limit = self.torque_limit
         self._torque = min(max(torque, -limit), limit)
         return Command(self._torque, FOLLOWING)
 

@@ -1,10 +1,11 @@
 """ROS node that follows a tree: /state in, /torque_command out. The law is in recovery.py.
 
-The tree is the file that /tree/selected names. A thread loads it, and the robot follows it from the
-next state on; a tree of another model, or a file that has changed since, is refused, and the one
-before stays. Every state is answered by the command of its stamp, zero torque included, so that
-the same node works in real time and in lock-step. On /diagnostics: mode, node, depth and branch,
-what the look-ups and the answers took, ages of the measurements and missed deadlines.
+The tree is the file that /tree/selected names. A thread loads it, and the robot follows it from
+the next state on; a tree of another model, or a file that has changed since, is refused, and the
+one before stays. Until the first one is there, states are not answered; then each is,
+by the command of its stamp, zero torque included, so that the same node works in real time and in
+lock-step. On /diagnostics: mode, node, depth and branch, what look-ups and answers took, ages of
+the measurements and missed deadlines.
 
 in    /state, /applied_torque, /tree/selected
 out   /torque_command, /tree/node, /diagnostics

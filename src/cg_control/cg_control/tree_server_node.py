@@ -1,8 +1,8 @@
 """ROS node of the tree server: it selects a tree, checks it, and shows what is done with it.
 
-`tree` selects, the name of one that comes along or a file; ~/load (std_srvs/Trigger) takes the file
-as it is now, after it was grown anew, and says whether it can be used. A tree that cannot be used,
-one of another model for instance, is an error in the log and in the answer of ~/load. The tree
+`tree` selects, the name of one that comes along or a file; ~/load (std_srvs/Trigger) takes the
+file as it is now, after it was grown anew, and says whether it can be used. One that cannot be
+used, of another model for instance, is an error in the log and in the answer of ~/load. The tree
 before stays selected.
 
 /tree/selected   path and SHA-256 of the file as JSON, latched: what the tree controller loads

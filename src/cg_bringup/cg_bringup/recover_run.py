@@ -1,0 +1,173 @@
+"""Recovery along a tree live: `ros2 run cg_bringup recover_balance --seed 3 --mode lockstep`.
+
+The robot begins somewhere in the funnels of a tree, away from upright, or upright and is pushed;
+it comes home as the tree says, and balances there. Starts the simulated hardware off its blocks,
+the observer, the tree server, the tree controller and the safety gate as processes of their own,
+for machines without `ros2 launch`; tree.launch.py starts the same nodes with the same parameters.
+The last line says whether the robot stands in the end, and so does the exit status.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cg_bringup.balance_run import MACHINE, carry_out
+from cg_bringup.balancing import FALLEN
+from cg_bringup.runs import CLOSING, MODES, NOMINAL_MODEL, NodeOf
+from cg_bringup.verdict import recovery_verdict
+from cg_control.grow_tree import BOX
+from cg_control.growth import Region
+from cg_control.lookup import Lookup
+from cg_control.tree import Tree, TreeError
+from cg_control.tree_files import tree_path
+from cg_description.paths import model_path
+from cg_dynamics.model import Model
+from cg_dynamics.rig import STANCES
+
+STARTS = ('funnel', 'upright')
+DRAWS = 10_000  # states tried for one that the tree claims
+
+
+@dataclass(frozen=True)
+class RecoverOptions:
+    """What `recover_balance` and the launch file are told.
+
+    Attributes:
+        robot: Model file of the simulated machine.
+        model: Model file of observer, tree and controller.
+        tree: Name or file.
+        start: 'funnel': a state that the tree claims, drawn by the seed; 'upright'.
+        stance: Leg that stands at an upright start.
+        mode: Clock of the machine.
+        seed: Of the start and of the sensor noise.
+        duration: In s; 0 for ever.
+        pushes: Instants in s and impulses in N s at the hip, in turn.
+        epsilon: Of the observer, s.
+        bag: Bag to record; none if empty.
+    """
+
+    robot: str = NOMINAL_MODEL
+    model: str = ''
+    tree: str = 'compass_gait_mit'
+    start: str = 'funnel'
+    stance: str = 'inner'
+    mode: str = 'real_time'
+    seed: int = 1
+    duration: float = 0.0
+    pushes: Sequence[float] = ()
+    epsilon: float = 0.02
+    bag: str = ''
+
+
+def claimed_state(tree: Tree, seed: int) -> tuple[str, np.ndarray]:
+    """A state in a funnel and in no goal region: the leg that stands, and x (4,).
+
+    Args:
+        tree: Of a compass gait.
+        seed: Says which.
+
+    Raises:
+        TreeError: The tree claims hardly anything.
+    """
+    leg, x = Region(np.array(BOX)).draw(np.random.default_rng(seed), DRAWS)
+    _, depth = Lookup(tree.nodes).best_of_many(leg, x)
+    away = ~(np.einsum('bi,bij,bj->b', x, tree.goal[leg], x) <= 1.0)
+    claimed = np.flatnonzero((depth <= 1.0) & away)
+    if not len(claimed):
+        raise TreeError(f'the tree claims none of {DRAWS} states outside its goals')
+    return STANCES[leg[claimed[0]]], x[claimed[0]]
+
+
+def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
+    """Node name -> what to start, in the order of ending.
+
+    Raises:
+        TreeError: There is no such tree of this model.
+    """
+    rate = {'sample_rate_hz': 500.0}
+    path = tree_path(options.tree)
+    stance, x = options.stance, np.zeros(4)
+    if options.start == 'funnel':
+        model = Model.load(model_path(options.model or NOMINAL_MODEL))
+        stance, x = claimed_state(Tree.load(path, model), options.seed)
+    machine: dict[str, Any] = {
+        'model_file': options.robot,
+        'setup': yaml.safe_dump({'stance': stance, 'on_blocks': False}),
+        'initial_state': x.tolist(),
+        'mode': options.mode,
+        'seed': options.seed,
+        'duration': options.duration,
+        'await_answer': True,
+        'experiment': 'recover_balance',
+        'closed_loop': True,
+        'exit_when_done': True,
+        'fall_angle': FALLEN,
+        **rate,
+    }
+    if options.pushes:
+        machine['pushes'] = [float(number) for number in options.pushes]
+    observer = {'model_file': options.model, 'epsilon': options.epsilon, **rate}
+    nodes = {
+        MACHINE: NodeOf('cg_hardware', 'simulation_node', machine),
+        'tree_server': NodeOf(
+            'cg_control', 'tree_server_node',
+            {'model_file': options.model, 'tree': str(path)},
+        ),
+        'tree_controller': NodeOf(
+            'cg_control', 'tree_controller_node', {'model_file': options.model, **rate},
+            (('/torque_command', '/torque_request'),),
+        ),
+        'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
+        'observer': NodeOf('cg_estimation', 'observer_node', observer),
+    }  # fmt: skip
+    if options.bag:
+        machine['recorders'] = 1
+        recorder = {
+            'bag': options.bag,
+            'mechanism': 'compass_gait',
+            'time': 'stamp' if options.mode == 'lockstep' else 'receipt',
+        }
+        nodes['recorder'] = NodeOf('cg_sysid', 'recorder_node', recorder, ending=CLOSING)
+    return nodes
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_bringup recover_balance`."""
+    default = RecoverOptions()
+    parser = argparse.ArgumentParser(prog='recover_balance', description=__doc__)
+    parser.add_argument('--robot', default=default.robot, help='simulated: a model file or a name')
+    parser.add_argument('--model', default='', help='of observer, tree and controller: the same')
+    parser.add_argument(
+        '--tree', default=default.tree, help=f'a file or a name [{default.tree}]'
+    )
+    parser.add_argument('--start', choices=STARTS, default='funnel', help='[funnel]')
+    parser.add_argument('--stance', choices=STANCES, default='inner', help='upright: [inner]')
+    parser.add_argument('--mode', choices=MODES, default='real_time', help='[real_time]')
+    parser.add_argument('--seed', type=int, default=1, help='of start and sensor noise [1]')
+    parser.add_argument('--duration', type=float, default=6.0, help='in s, 0 for ever [6]')
+    parser.add_argument(
+        '--pushes', type=float, nargs='*', default=[], help='t1 P1 t2 P2 ... in s and N s'
+    )
+    parser.add_argument(
+        '--epsilon', type=float, default=default.epsilon,
+        help=f'of the observer, s [{default.epsilon}]',
+    )  # fmt: skip
+    parser.add_argument('--bag', default='', help='bag to record [none]')
+    options = RecoverOptions(**vars(parser.parse_args(args)))
+    try:
+        nodes = recover_nodes(options)
+    except (ValueError, OSError) as error:
+        print(f'recover_balance: {error}', file=sys.stderr)
+        return 2
+    return carry_out(
+        'recover_balance', nodes, lambda o: recovery_verdict(o, options.pushes)
+    )
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
