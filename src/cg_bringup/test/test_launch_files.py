@@ -81,3 +81,15 @@ def test_a_robot_that_falls_is_an_error():
     status, said = launch('balance', 'lean:=0.3', 'mode:=lockstep', 'duration:=5')
     assert 'fell at' in said
     assert status == 1
+
+
+def test_a_tree_of_another_robot_ends_the_launch():
+    status, said = launch('tree', 'model:=compass_gait_flexible')
+    assert 'grown for a model with hash' in said
+    assert status == 1
+
+
+def test_a_robot_that_comes_home_is_no_error():
+    status, said = launch('tree', 'seed:=2', 'mode:=lockstep', 'duration:=2.5')
+    assert 'upright at the end' in said
+    assert status == 0

@@ -15,7 +15,7 @@ from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from cg_bringup import balance_run, rebalance_run  # noqa: E402
+from cg_bringup import balance_run, rebalance_run, recover_run  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import MACHINE_QOS  # noqa: E402
 
@@ -25,6 +25,7 @@ PATIENCE = 60.0  # s for start-up on a busy machine
 RUNNERS = {
     'balance': ['cg_bringup.balance_run', '--lean', '0'],
     'rebalance': ['cg_bringup.rebalance_run', '--start-after', '0', '--duration', '0'],
+    'recover': ['cg_bringup.recover_run', '--start', 'upright', '--duration', '0'],
     'experiment': ['cg_bringup.experiment', 'legs_tied', '--duration', '60'],
     'demo': ['cg_bringup.demo', '--seed', '1', '--duration', '60'],
 }
@@ -95,6 +96,7 @@ def ear():
         ('balance', 'lockstep', signal.SIGHUP),
         ('balance', 'real_time', signal.SIGKILL),
         ('rebalance', 'lockstep', signal.SIGKILL),
+        ('recover', 'lockstep', signal.SIGTERM),
         ('experiment', 'lockstep', signal.SIGTERM),
         ('experiment', 'real_time', signal.SIGHUP),
         ('experiment', 'lockstep', signal.SIGINT),
@@ -179,6 +181,13 @@ def test_a_fall_ends_the_run_and_is_said(capsys):
     status, line = last_line(capsys, balance_run.main, '--duration', '5', '--lean', '0.3')
     assert line.startswith('balance: fell at 0.')
     assert status == 1
+
+
+def test_recovery_ends_with_what_the_robot_did(capsys):
+    status, line = last_line(capsys, recover_run.main, '--duration', '2.5', '--seed', '2')
+    assert line.startswith('recover_balance: upright at the end: 2.50 s on the outer leg, ')
+    assert ', step at 0.' in line
+    assert status == 0
 
 
 def test_a_node_that_does_not_start_ends_the_run(capfd):

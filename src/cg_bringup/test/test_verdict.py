@@ -2,7 +2,7 @@
 
 import pytest
 
-from cg_bringup.verdict import balance_verdict, rebalance_verdict
+from cg_bringup.verdict import balance_verdict, rebalance_verdict, recovery_verdict
 from cg_hardware.standing import Outcome, Standing
 
 SAMPLE = 0.002  # s
@@ -67,6 +67,19 @@ def test_another_count_of_steps(stances, asked, worked, words):
     verdict = rebalance_verdict(watched([0.0] * 400, stances=stances), 'inner', asked)
     assert verdict.worked == worked
     assert verdict.line.startswith(words.replace('of 1', 'of one').replace(' 1', ' one'))
+
+
+def test_a_robot_that_comes_home_takes_the_steps_that_it_takes():
+    outcome = watched([0.3] * 250 + [0.01] * 750, stances=['inner'] * 250 + ['outer'] * 750)
+    verdict = recovery_verdict(outcome, [1.0, 0.5])
+    assert verdict.worked
+    assert verdict.line == (
+        'upright at the end: 2.00 s on the outer leg, largest lean 0.300 rad, '
+        '1 of 1 pushes survived, step at 0.50 s'
+    )
+    verdict = recovery_verdict(watched([0.1] * 500 + [0.7]))
+    assert not verdict.worked
+    assert verdict.line == 'fell at 1.00 s on the inner leg'
 
 
 def test_outcome_is_kept_in_a_file(tmp_path):

@@ -182,7 +182,7 @@ class TreeController:
             self._rest(OUTSIDE)
             return Command(0.0, OUTSIDE, reason)
         best = self._best(stance, x)
-        command = self._balanced(stamp_ns, stance, x, landed)
+        command = self._balanced(stamp_ns, stance, x, landed, best)
         return command or self._followed(stamp_ns, stance, x, best)
 
     def _doubt(self) -> str:
@@ -203,12 +203,12 @@ class TreeController:
         return ''
 
     def _balanced(
-        self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool
+        self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool, best: Claim
     ) -> Command | None:
         """The balance controller's answer, where (HOME) gives it the robot."""
         if self.mode == BALANCING and not landed:
             depth = self._depth_in_basin(stance, x)
-            at_home = depth <= self.settings.hold
+            at_home = depth <= (1.0 if best.depth <= 1.0 else self.settings.hold)
         else:
             depth = self._depth_in_goal(stance, x)
             at_home = depth <= 1.0

@@ -1,0 +1,154 @@
+"""Recovery along a tree with all its nodes, on real topics in lock-step, and in the loop."""
+
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+rclpy = pytest.importorskip('rclpy')
+
+from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+
+from cg_bringup import recover_run  # noqa: E402
+from cg_bringup.balancing import balance  # noqa: E402
+from cg_bringup.recover_run import RecoverOptions, claimed_state, recover_nodes  # noqa: E402
+from cg_control.balance import BalanceController, balance_gains  # noqa: E402
+from cg_control.basin import shipped_basins  # noqa: E402
+from cg_control.lookup import Lookup  # noqa: E402
+from cg_control.recovery import ReadyTree, RecoverySettings, TreeController  # noqa: E402
+from cg_control.tree import Tree, TreeError  # noqa: E402
+from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
+from cg_control.tree_files import tree_path  # noqa: E402
+from cg_control.tree_server_node import TreeServerNode  # noqa: E402
+from cg_description.paths import model_path  # noqa: E402
+from cg_dynamics.domains import own_domain  # noqa: E402
+from cg_dynamics.model import Model  # noqa: E402
+from cg_dynamics.plant import Plant  # noqa: E402
+from cg_dynamics.rig import STANCES, Setup  # noqa: E402
+from cg_estimation.high_gain import HighGainObserver  # noqa: E402
+from cg_estimation.observer_node import ObserverNode  # noqa: E402
+from cg_hardware.simulation_node import SimulationNode  # noqa: E402
+
+NODES = {
+    'observer': ObserverNode,
+    'tree_server': TreeServerNode,
+    'tree_controller': TreeControllerNode,
+    'simulation_node': SimulationNode,
+}
+PATIENCE = 60.0  # s
+MODEL = Model.load(model_path('compass_gait_mit'))
+
+
+@pytest.fixture(scope='module')
+def tree():
+    return Tree.load(tree_path('compass_gait_mit'), MODEL)
+
+
+@pytest.mark.alone
+def test_robot_comes_home_along_the_tree_and_balances():
+    """Noise, quantisation and an observer in the loop; the start is a step away from upright."""
+    options = RecoverOptions(mode='lockstep', duration=4.0, seed=2)
+    modes = []
+    with own_domain():
+        rclpy.init()
+        try:
+            started = recover_nodes(options)
+            nodes = {
+                name: kind(
+                    parameter_overrides=[
+                        Parameter(key, value=value)
+                        for key, value in started[name].parameters.items()
+                    ]
+                )
+                for name, kind in NODES.items()
+            }
+            executor = EventsExecutor()
+            for node in nodes.values():
+                executor.add_node(node)
+            machine, controller = nodes['simulation_node'], nodes['tree_controller'].controller
+            deadline = time.monotonic() + PATIENCE
+            while not machine.finished:
+                assert time.monotonic() < deadline
+                for node in nodes.values():
+                    node.poll()
+                executor.spin_once(timeout_sec=0.002)
+                if not modes or controller.mode != modes[-1]:
+                    modes.append(controller.mode)
+            state, stance = machine.plant.state, machine.plant.stance
+            steps = machine.standing.outcome.stepped_at
+            for node in nodes.values():
+                executor.remove_node(node)
+                getattr(node, 'close', lambda: None)()
+                node.destroy_node()
+        finally:
+            rclpy.try_shutdown()
+    assert modes == ['idle', 'following', 'balancing']
+    assert machine.exit_status == 0
+    assert len(steps) == 1
+    # What dry friction and noise leave of a balanced robot.
+    standing = STANCES.index(stance)
+    assert np.abs(state[[standing, 2 + standing]]).max() < 0.05
+
+
+def test_nodes_are_told_one_robot_one_tree_and_one_start(tree):
+    nodes = recover_nodes(RecoverOptions(seed=5, pushes=(1.0, 2.0), bag='here'))
+    machine = nodes['simulation_node'].parameters
+    stance, x = claimed_state(tree, 5)
+    setup = yaml.safe_load(machine['setup'])
+    assert setup == {'stance': stance, 'on_blocks': False}
+    assert machine['initial_state'] == x.tolist()
+    assert machine['pushes'] == [1.0, 2.0]
+    assert (machine['recorders'], nodes['recorder'].parameters['bag']) == (1, 'here')
+    assert nodes['tree_server'].parameters['tree'] == str(tree_path('compass_gait_mit'))
+    upright = recover_nodes(RecoverOptions(start='upright', stance='outer', model='mine.yaml'))
+    assert upright['simulation_node'].parameters['initial_state'] == [0.0] * 4
+    for name in ('observer', 'tree_server', 'tree_controller'):
+        assert upright[name].parameters['model_file'] == 'mine.yaml'
+
+
+def test_a_start_is_claimed_and_not_at_home(tree):
+    for seed in range(20):
+        stance, x = claimed_state(tree, seed)
+        leg = STANCES.index(stance)
+        assert Lookup(tree.nodes).best(leg, x).depth <= 1.0
+        assert x @ tree.goal[leg] @ x > 1.0
+    tree = Tree(tree.nodes, 1e-9 * tree.goal)
+    with pytest.raises(TreeError, match='claims none of'):
+        claimed_state(tree, 1)
+
+
+def test_pushes_are_answered_by_steps_with_an_observer(tree):
+    """6 N s at the hip: balance alone falls, the tree takes a step, without planning one."""
+    settings = RecoverySettings()
+    gains = balance_gains(MODEL, settings, 0.002)
+    stood = []
+    for ready in (None, ReadyTree.of(tree, MODEL)):
+        alone = BalanceController(
+            MODEL, settings, gains, shipped_basins(MODEL, gains, MODEL.torque_limit)
+        )
+        controller = alone
+        if ready is not None:
+            controller = TreeController(alone, MODEL, settings)
+            controller.take(ready)
+        setup = Setup(stance='inner', on_blocks=False)
+        plant = Plant(MODEL, setup, np.zeros(4), seed=3)
+        observer = HighGainObserver(MODEL, setup, 0.02)
+        run = balance(plant, observer, controller, 4.0, ((0.5, 6.0),))
+        stood.append(run.upright(4.0))
+        steps = np.flatnonzero(np.diff(run.standing))
+    assert stood == [False, True]
+    assert len(steps) == 1
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        (['--tree', 'oak'], "recover_balance: no tree 'oak'"),
+        (['--model', 'compass_gait_flexible'], 'grown for a model with hash'),
+    ],
+)
+def test_a_tree_that_cannot_be_followed_starts_nothing(given, said, capsys):
+    assert recover_run.main(given) == 2
+    assert said in capsys.readouterr().err
