@@ -40,7 +40,7 @@ from cg_estimation.high_gain import HighGainObserver
 DURATION = 4.0  # s
 PUSHED_AT = 0.5  # s
 IMPULSES = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # N s
-EPSILONS = (0.02, 0.2)  # s
+EPSILONS = (0.01, 0.02, 0.2)  # s
 RESULT = Path(__file__).parent / 'results' / 'trees_live.md'
 MODEL = Model.load(model_path('compass_gait_mit'))
 GAINS = balance_gains(MODEL, BalanceSettings(), LANDING.sample_time)

@@ -6,8 +6,8 @@ Six processes: machine, observer, tree server, tree controller, gate, and a list
 what the controller says on /diagnostics. The robot begins at a state that the tree claims, comes
 home, and balances; every state is looked up, at home as well. *Look-up* is the time of one product
 and its least entry in the controller's process, *answer* that from a state's arrival to its torque
-on the topic. A *slow* answer took longer than a sample, 2 ms. *Age* is that of the measurement when
-the drive latched the torque that answers it, *late* if more than 4 ms.
+on the topic. A *slow* answer took longer than a sample, 2 ms. *Age* is that of the measurement
+when the drive latched the torque that answers it, *late* if more than 4 ms.
 """
 
 import argparse

@@ -60,7 +60,7 @@ class RecoverOptions:
     seed: int = 1
     duration: float = 0.0
     pushes: Sequence[float] = ()
-    epsilon: float = 0.02
+    epsilon: float = 0.01
     bag: str = ''
 
 

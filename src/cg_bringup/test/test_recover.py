@@ -120,7 +120,7 @@ def test_a_start_is_claimed_and_not_at_home(tree):
 
 
 def test_pushes_are_answered_by_steps_with_an_observer(tree):
-    """6 N s at the hip: balance alone falls, the tree takes a step, without planning one."""
+    """5 N s at the hip: balance alone falls, the tree takes a step, without planning one."""
     settings = RecoverySettings()
     gains = balance_gains(MODEL, settings, 0.002)
     stood = []
@@ -134,8 +134,8 @@ def test_pushes_are_answered_by_steps_with_an_observer(tree):
             controller.take(ready)
         setup = Setup(stance='inner', on_blocks=False)
         plant = Plant(MODEL, setup, np.zeros(4), seed=3)
-        observer = HighGainObserver(MODEL, setup, 0.02)
-        run = balance(plant, observer, controller, 4.0, ((0.5, 6.0),))
+        observer = HighGainObserver(MODEL, setup, 0.01)
+        run = balance(plant, observer, controller, 4.0, ((0.5, 5.0),))
         stood.append(run.upright(4.0))
         steps = np.flatnonzero(np.diff(run.standing))
     assert stood == [False, True]

@@ -73,8 +73,9 @@ class Lookup:
         for leg in range(len(STANCES)):
             index = np.flatnonzero((nodes.stance == leg) & (rho > 0) & (nodes.span > 0))
             self._index.append(index)
-            # Rows over rho: the product is the depth itself.
-            self._matrix.append(np.ascontiguousarray(self._all[index] / rho[index, None]))
+            # Over rho: the product is the depth itself. One column a node: 15 long rows are gone
+            # through twice as fast as thousands of short ones.
+            self._matrix.append(np.ascontiguousarray((self._all[index] / rho[index, None]).T))
             self._costs.append(np.empty(len(index)))
 
     def best(self, leg: int, x: np.ndarray) -> Claim:
@@ -91,7 +92,7 @@ class Lookup:
         x = x[:nx]
         np.multiply(x[self._i], x[self._j], out=m[: self._squares])
         m[self._linear] = x
-        depths = np.dot(self._matrix[leg], m, out=self._costs[leg])
+        depths = np.dot(m, self._matrix[leg], out=self._costs[leg])
         row = depths.argmin()
         return Claim(int(index[row]), max(float(depths[row]), 0.0))
 
@@ -112,7 +113,7 @@ class Lookup:
         for number, (index, matrix) in enumerate(zip(self._index, self._matrix, strict=True)):
             rows = np.flatnonzero(leg == number)
             if len(rows) and len(index):
-                depths = monomials(x[rows, : self.nodes.x0.shape[1]]) @ matrix.T
+                depths = monomials(x[rows, : self.nodes.x0.shape[1]]) @ matrix
                 for k, row in enumerate(rows):
                     if but and but[int(row)]:
                         depths[k, np.isin(index, but[int(row)])] = math.inf

@@ -10,7 +10,7 @@ from cg_control.balance import BalanceController, balance_gains
 from cg_control.basin import shipped_basins
 from cg_control.grow_tree import BOX, LANDING
 from cg_control.growth import Grower, Region
-from cg_control.lookup import Lookup
+from cg_control.lookup import Claim, Lookup
 from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings, TreeController
 from cg_control.tree import Tree, TreeError
 from cg_control.tree_files import tree_path
@@ -100,6 +100,23 @@ def test_at_home_it_balances_and_out_of_the_basin_it_follows_again(make, starts)
     leg, x, _ = starts
     row = np.flatnonzero(leg == INNER)[0]
     assert tell(controller, 2, INNER, x[row]).mode == FOLLOWING
+
+
+def test_it_leaves_the_basin_for_a_funnel_and_otherwise_late(make, tree, ready, monkeypatch):
+    controller = make()
+    basin = controller.balance.basins['inner']
+    edge, goal = basin.bounds[0], basin.bounds[-1]  # of the basin, and of the goal region in it
+    just_out, far_out, between = (
+        basin.modes.state(z, 0.0, 0.0, 0.0) for z in (1.05 * edge, 2.1 * edge, (edge + goal) / 2)
+    )
+    tell(controller, 0, INNER, np.zeros(4))
+    assert tell(controller, 1, INNER, just_out).mode == FOLLOWING  # a funnel holds it
+    # Back at home it balances again only in the goal region: this is the hysteresis.
+    assert tell(controller, 2, INNER, between).mode == FOLLOWING
+    assert tell(controller, 3, INNER, np.zeros(4)).mode == 'balancing'
+    monkeypatch.setattr(ready.lookup, 'best', lambda leg, x: Claim(0, 5.0))
+    assert tell(controller, 4, INNER, just_out).mode == 'balancing'
+    assert tell(controller, 5, INNER, far_out).mode == OUTSIDE
 
 
 def test_the_balance_controller_takes_the_torque_over(make, tree):
