@@ -2,17 +2,20 @@
 
 At every measurement, in this order:
 
-    1. In the goal region of the leg that stands the robot balances, and goes on balancing until
-       it is out of the balance controller's basin.                                      (HOME)
+    1. In the goal region of the leg that stands the robot balances. It leaves the basin of
+       the balance controller for a funnel that holds it, or when it is far out.         (HOME)
     2. It follows its node as long as the funnel there holds it. It goes over to the node at
        which its state is least deep, if it has left its funnel, or if it is so much less deep
        there and home is not further.                                                    (SWITCH)
     3. Outside every funnel there is no torque, until a funnel holds the state again.    (OUTSIDE)
 
 Nothing is planned meanwhile: what a push does to the state is answered by another node. A foot
-that lands where no impact was planned is a state like any other. *Hysteresis*: what the robot is
-in counts as larger by `hold`, and a rival must be less deep by `margin`, so that noise at the edge
-of a funnel, or between two nodes, changes nothing.
+that lands where no impact was planned is a state like any other.
+
+*Hysteresis.* A robot is in a funnel, or in the basin, until its depth there is `hold`; it enters
+at 1. A rival must be less deep by `margin`. So noise at the edge of a funnel, or between two
+nodes, changes nothing. `hold` is more than that: who comes by a node further out than rho often
+comes home, for rho is where one in a hundred does not (levels.py).
 """
 
 import collections
