@@ -89,7 +89,7 @@ def recovered(
     balancing = BalanceController(MODEL, settings, GAINS, BASINS)
     controller = balancing
     if ready is not None:
-        controller = TreeController(balancing, MODEL, settings)
+        controller = TreeController(balancing, settings)
         controller.take(ready)
     run = balance(plant, observer, controller, DURATION, pushes)
     switches = getattr(controller, 'switches', 0)

@@ -184,9 +184,10 @@ def test_a_fall_ends_the_run_and_is_said(capsys):
 
 
 def test_recovery_ends_with_what_the_robot_did(capsys):
-    status, line = last_line(capsys, recover_run.main, '--duration', '2.5', '--seed', '2')
-    assert line.startswith('recover_balance: upright at the end: 2.50 s on the outer leg, ')
-    assert ', step at 0.' in line
+    upright = ('--start', 'upright', '--stance', 'outer', '--pushes', '0.3', '1')
+    status, line = last_line(capsys, recover_run.main, '--duration', '1.5', *upright)
+    assert line.startswith('recover_balance: upright at the end: 1.50 s on the outer leg, ')
+    assert line.endswith('1 of 1 pushes survived')
     assert status == 0
 
 

@@ -13,9 +13,10 @@ Nothing is planned meanwhile: what a push does to the state is answered by anoth
 that lands where no impact was planned is a state like any other.
 
 *Hysteresis.* A robot is in a funnel, or in the basin, until its depth there is `hold`; it enters
-at 1. A rival must be less deep by `margin`. So noise at the edge of a funnel, or between two
-nodes, changes nothing. `hold` is more than that: who comes by a node further out than rho often
-comes home, for rho is where one in a hundred does not (levels.py).
+at 1. A rival must be less deep by `margin`. The torque ends when no funnel has held the state for
+`patience`. So noise at the edge of a funnel, or between two nodes, changes nothing. `hold` and
+`patience` are more than that: who comes by a node further out than rho often comes home, for rho
+is where one in a hundred does not, and from node to node it is ragged (levels.py).
 """
 
 import collections
@@ -65,6 +66,10 @@ class RecoverySettings(BalanceSettings):
         4.0, 'depth at which the robot leaves the funnel or the basin that it is in; it enters '
         'at 1', minimum=1.0, maximum=1e6, live=True,
     )  # fmt: skip
+    patience: float = setting(
+        0.03, 'time beyond `hold`, and in no other funnel, after which the torque ends', unit='s',
+        minimum=0.0, maximum=1.0, live=True,
+    )  # fmt: skip
     margin: float = setting(
         2.0, 'by how much less deep a state must be elsewhere for the robot to go over',
         minimum=0.0, maximum=1e6, live=True,
@@ -110,7 +115,6 @@ class TreeController:
 
     Args:
         balance: Of both legs; engages in the goal regions of the tree.
-        model: The robot as it is known.
         settings: May be replaced between steps by `adopt`; those of `balance` are its own.
 
     Attributes:
@@ -123,13 +127,13 @@ class TreeController:
         lookup_times: Of the last look-ups, s.
     """
 
-    def __init__(self, balance: BalanceController, model: Model, settings: RecoverySettings):
-        self.balance, self.model, self.settings = balance, model, settings
+    def __init__(self, balance: BalanceController, settings: RecoverySettings):
+        self.balance, self.settings = balance, settings
         self.mode, self.node, self.entered = IDLE, -1, -1
         self.depth, self.switches = math.inf, 0
         self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._ready: ReadyTree | None = None
-        self._stance, self._torque = '', 0.0
+        self._stance, self._torque, self._held_ns = '', 0.0, 0
 
     @property
     def tree(self) -> Tree | None:
@@ -247,20 +251,27 @@ class TreeController:
         if self.mode == FOLLOWING:
             torque = tracker.torque(stamp_ns * 1e-9, stance, x)
             here = self._depth_here(stance, x)
-        lost = here > self.settings.hold  # NaN, where none is said, is not
-        if lost and best.depth > 1.0:
+        lost = here > self.settings.hold  # NaN, where no depth is said, is not
+        if not lost:
+            self._held_ns = stamp_ns
+        if lost and best.depth > 1.0 and self._waited(stamp_ns, here):
             self._rest(OUTSIDE)
             self.depth = best.depth
             return Command(0.0, OUTSIDE, f'outside every funnel: depth {best.depth:.3g}')
-        if lost or (best.depth < here - self.settings.margin and self._nearer(best.node)):
+        nearer = best.depth < here - self.settings.margin and self._nearer(best.node)
+        if nearer or (lost and best.depth <= 1.0):
             self.switches += self.mode == FOLLOWING
             tracker.begin(best.node)
-            self.entered = best.node
+            self.entered, self._held_ns = best.node, stamp_ns
             torque, here = tracker.torque(stamp_ns * 1e-9, stance, x), best.depth
         self.mode, self.node, self.depth = FOLLOWING, tracker.node, here
         limit = self.torque_limit
         self._torque = min(max(torque, -limit), limit)
         return Command(self._torque, FOLLOWING)
+
+    def _waited(self, stamp_ns: int, here: float) -> bool:
+        """Whether the robot gives its node up. One whose plan is over has no choice."""
+        return math.isinf(here) or (stamp_ns - self._held_ns) * 1e-9 >= self.settings.patience
 
     def _best(self, stance: str, x: np.ndarray) -> Claim:
         assert self._ready is not None

@@ -87,7 +87,7 @@ class TreeControllerNode(Node):
         self.design = LiveDesign(
             path, model, settings, 1.0 / settings.sample_rate_hz, log=self.get_logger().info
         )
-        self.controller = TreeController(self.design.controller, model, settings)
+        self.controller = TreeController(self.design.controller, settings)
         self.loader = TreeLoader(model)
         self.problem = 'no tree selected yet'
         self._selection: TreeSelection | None = None
