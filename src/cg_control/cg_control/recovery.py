@@ -271,7 +271,7 @@ class TreeController:
 
     def _waited(self, stamp_ns: int, here: float) -> bool:
         """Whether the robot gives its node up. One whose plan is over has no choice."""
-        return math.isinf(here) or (stamp_ns - self._held_ns) * 1e-9 >= self.settings.patience
+        return math.isinf(here) or stamp_ns - self._held_ns >= 1e9 * self.settings.patience
 
     def _best(self, stance: str, x: np.ndarray) -> Claim:
         assert self._ready is not None

@@ -141,8 +141,9 @@ def test_outside_every_funnel_there_is_no_torque_until_one_holds_the_state(
     assert controller.entered == node[row]
     # It may be on its way home all the same: the torque ends when `patience` is over.
     ticks = round(controller.settings.patience * 1e9 / SAMPLE_NS)
-    modes = [tell(controller, 2 + k, INNER, unclaimed).mode for k in range(ticks)]
-    assert modes == [FOLLOWING] * (ticks - 1) + [OUTSIDE]
+    modes = [tell(controller, 2 + k, INNER, unclaimed).mode for k in range(ticks + 1)]
+    assert modes[: ticks - 1] == [FOLLOWING] * (ticks - 1)
+    assert modes[-1] == OUTSIDE
     assert controller.entered == -1
 
 
