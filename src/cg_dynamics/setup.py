@@ -34,6 +34,6 @@ setup(
         'PyYAML',
         'scipy',
     ],
-    extras_require={'test': ['pytest', 'pytest-timeout']},
+    extras_require={'cluster': ['distributed'], 'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
 )

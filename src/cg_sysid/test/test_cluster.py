@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import json
 import math
 import os
 import shutil
@@ -15,11 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from cluster_processes import LONG, Processes, names_of_workers, read, until
 
 import cg_sysid
+from cg_dynamics import cluster
+from cg_dynamics.cluster import FETCHES, _fetched
 from cg_dynamics.model import Model
-from cg_sysid import cluster, diagnose_cli
-from cg_sysid.cluster import FETCHES, Cluster, ClusterError, _fetched
+from cg_sysid import cluster as ours
+from cg_sysid import diagnose_cli
+from cg_sysid.cluster import Cluster, ClusterError
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
 from cg_sysid.parallel import run_all
@@ -27,72 +30,6 @@ from cg_sysid.parallel import run_all
 distributed = pytest.importorskip('distributed', reason='the cluster part is not installed')
 
 EFFECTS = ('torque_bias', 'quadratic_friction', 'torque_constant')
-LONG = 60.0  # s; whatever takes longer hangs
-
-
-class Processes:
-    """A scheduler and its workers, on ports that are free, without nannies that restart them."""
-
-    def __init__(self, folder: Path, **settings: str):
-        self.folder, self.running = folder, []
-        self.environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **settings}
-
-    def __enter__(self):
-        notes = self.folder / 'scheduler.json'
-        self.scheduler = self._start('scheduler', '--scheduler-file', str(notes))
-        self.address = json.loads(until(lambda: read(notes)))['address']
-        return self
-
-    def __exit__(self, *exc):
-        for process in reversed(self.running):
-            process.kill()
-            process.wait()
-
-    def add_worker(self, first_on_path: Path | None = None) -> tuple[str, subprocess.Popen]:
-        """Name and process of a worker that the scheduler knows, with one thread."""
-        environment = dict(self.environment)
-        if first_on_path:
-            environment['PYTHONPATH'] = f'{first_on_path}{os.pathsep}{environment["PYTHONPATH"]}'
-        name = f'worker{len(self.running)}'
-        worker = self._start(
-            'worker', self.address, '--name', name, '--nthreads', '1', '--no-nanny',
-            '--local-directory', str(self.folder), environment=environment,
-        )  # fmt: skip
-        with self.client() as client:
-            until(lambda: name in names_of_workers(client))
-        return name, worker
-
-    def client(self):
-        return distributed.Client(self.address, set_as_default=False)
-
-    def _start(self, kind, *words, environment=None):
-        log = (self.folder / f'{kind}{len(self.running)}.log').open('w')
-        self.running.append(
-            subprocess.Popen(
-                [sys.executable, '-m', f'distributed.cli.dask_{kind}', *words, '--host',
-                 '127.0.0.1', '--port' if kind == 'scheduler' else '--worker-port', '0',
-                 '--dashboard-address', '127.0.0.1:0'],
-                cwd=self.folder, env=environment or self.environment, stdout=log, stderr=log,
-            )
-        )  # fmt: skip
-        return self.running[-1]
-
-
-def until(condition, limit=LONG):
-    """Wait for something to be true; returns it."""
-    deadline = time.monotonic() + limit
-    while not (found := condition()):
-        assert time.monotonic() < deadline, 'waited in vain'
-        time.sleep(0.01)
-    return found
-
-
-def read(file):
-    return file.exists() and file.read_text()
-
-
-def names_of_workers(client):
-    return {worker['name'] for worker in client.scheduler_info()['workers'].values()}
 
 
 # Workers cannot import tests: what they run of this file has no name, so that it travels whole.
@@ -140,7 +77,7 @@ def test_the_answer_is_that_of_local_processes(processes, local, intake, model_f
     with Cluster(processes.address) as workers, processes.client() as client:
         found = diagnose(Model.load(model_file), intake.records, options, executor=workers)
         # Two sets of trials, sent once each, however many fits there were.
-        sent = [key for key in tasks(client) if key.startswith('cg_sysid')]
+        sent = [key for key in tasks(client) if key.startswith('compass_gait')]
     assert len(sent) == 2
     assert_same(found, local)
 
@@ -315,8 +252,8 @@ def refused(processes, first_on_path, why):
 
 
 def test_another_python_is_refused(processes, monkeypatch):
-    other = {**cluster.software_here(), 'python': '3.4.1'}
-    monkeypatch.setattr(cluster, 'software_here', lambda: other)
+    other = {**ours.software_here(), 'python': '3.4.1'}
+    monkeypatch.setattr(ours, 'software_here', lambda: other)
     with pytest.raises(ClusterError, match=r'it has python 3.*, this process 3\.4\.1'):
         Cluster(processes.address)
 
