@@ -34,6 +34,7 @@ from cg_description.paths import model_path
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.watched_processes import WatchedProcesses
 
 HALF = np.array([0.5, 0.8, 1.5, 4.0])  # rad, rad, rad/s, rad/s, as in trees_screen.py
 LANDING = WalkOptions(sample_time=0.002, step=0.002, minimum_step=0.1)
@@ -105,7 +106,8 @@ def judged(grower: Grower, legs: np.ndarray, x: np.ndarray) -> tuple[Share, Shar
 def grow(samples: int, workers: int) -> tuple[Grower, list[str], str]:
     """A tree, the rows of its growth curve and a sentence about its cost."""
     model = Model.load(model_path('compass_gait_mit'))
-    extension = Extension(model, workers=workers)
+    processes = WatchedProcesses(workers) if workers > 1 else None
+    extension = Extension(model, executor=processes)
     grower = Grower(
         model, roots(model), Region(HALF), extension, GrowthOptions(at_once=16),
         simulation=LANDING, threads=workers,
@@ -126,7 +128,8 @@ def grow(samples: int, workers: int) -> tuple[Grower, list[str], str]:
                 f'| {covered} | {false} |'
             )
             print(rows[-1], flush=True)
-    extension.close()
+    if processes is not None:
+        processes.shutdown()
     words = (
         f'{grower.counts.samples} states in {spent:.0f} s of wall time with {workers} workers: '
         f'{1e3 * spent / grower.counts.samples:.2f} ms a state; {grower.counts.planned} were '

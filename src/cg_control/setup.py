@@ -47,7 +47,7 @@ setup(
         'numpy',
         'scipy',
     ],
-    extras_require={'test': ['pytest', 'pytest-timeout']},
+    extras_require={'cluster': ['distributed'], 'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
     entry_points={
         'console_scripts': [

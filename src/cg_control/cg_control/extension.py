@@ -14,15 +14,16 @@ being there. A limited torque fails where the former is large.
 
 import contextlib
 import dataclasses
-import multiprocessing
+import functools
+import pickle
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from cg_control.collocation import PlanningError, optimise, planning_model
-from cg_control.growth import Branch
+from cg_control.growth import Branch, GivenUp
 from cg_control.linearise import linearise_stance
 from cg_control.lookup import Lookup
 from cg_control.lqr import lqr
@@ -34,6 +35,7 @@ from cg_control.trajectory import Trajectory, TrajectoryError
 from cg_control.tvlqr import Weights, stabilise
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.watched_processes import WorkLost
 
 FUNNEL = 0.03  # weight of deviations in the form of a funnel, as a share of that of the gains
 SOON = Guess(0.15, 0.3)  # what joins the tree nearby takes no longer
@@ -111,7 +113,8 @@ class Extension:
         model: The robot.
         goals: Legs on which upright is home.
         options: What is tried.
-        workers: Processes that plan; 1 plans here. Results do not depend on it.
+        executor: Whose workers plan, such as WatchedProcesses or Cluster; None plans here. Results
+            do not depend on it. A state over which it raises WorkLost is given up.
     """
 
     def __init__(
@@ -119,22 +122,15 @@ class Extension:
         model: Model,
         goals: Sequence[str] = STANCES,
         options: ExtensionOptions | None = None,
-        workers: int = 1,
+        executor: Executor | None = None,
     ):
         self.model, self.goals = model, tuple(goals)
         self.options = options or ExtensionOptions()
         plant = planning_model(model, self.options.friction)
         self._screen = Screen(plant, reach=self.options.reach)
-        self._pool: ProcessPoolExecutor | None = None
-        if workers > 1:
-            self._pool = ProcessPoolExecutor(
-                workers, multiprocessing.get_context('spawn'), _prepare, (model, self.options)
-            )
-
-    def close(self) -> None:
-        """End the workers."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._executor = executor
+        # Packed once: it goes along with every state.
+        self._common = pickle.dumps((model, self.options))
 
     def promising(self, legs: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Least number of steps of a motion that may exist, (n,); more than allowed: none."""
@@ -149,8 +145,8 @@ class Extension:
 
     def __call__(
         self, nodes: Nodes, legs: np.ndarray, x: np.ndarray
-    ) -> list[Branch | None]:
-        """A branch for each state, or None."""
+    ) -> list[Branch | GivenUp | None]:
+        """For each state a branch, None if there is none, or that it was given up."""
         least, orders = self.promising(legs, x), []
         node, depth = Lookup(nodes).best_of_many(np.asarray(legs), x)
         for leg, state, steps, near, deep in zip(legs, x, least, node, depth, strict=True):
@@ -160,9 +156,14 @@ class Extension:
                 if near >= 0 and deep < self.options.near:
                     order += self._onto(nodes, int(near), int(leg), state)
             orders.append(order)
-        if self._pool is None:
+        if self._executor is None:
             return [first_of(order, self.model, self.options) for order in orders]
-        return list(self._pool.map(_in_worker, orders))
+        # What the screen rules out needs no worker.
+        futures = [
+            self._executor.submit(_plan, order, self._common) if order else None
+            for order in orders
+        ]
+        return [None if future is None else _planned(future) for future in futures]
 
     def _onto(self, nodes: Nodes, node: int, leg: int, x: np.ndarray) -> Iterator[Attempt]:
         with contextlib.suppress(ValueError):  # the robot rests there, or lands
@@ -207,14 +208,18 @@ def _branch(
     return Branch(followed, onto, elapsed, tuple(p.cost_to_go for p in light.phases))
 
 
-_of_worker: tuple[Model, ExtensionOptions] | None = None
+def _planned(future: Future) -> Branch | GivenUp | None:
+    try:
+        return future.result()
+    except WorkLost:
+        return GivenUp()
 
 
-def _prepare(model: Model, options: ExtensionOptions) -> None:
-    global _of_worker
-    _of_worker = model, options
+def _plan(order: Sequence[Attempt], common: bytes) -> Branch | None:
+    """On a worker: as `first_of`."""
+    return first_of(order, *_unpacked(common))
 
 
-def _in_worker(order: Sequence[Attempt]) -> Branch | None:
-    assert _of_worker is not None
-    return first_of(order, *_of_worker)
+@functools.lru_cache(maxsize=1)
+def _unpacked(common: bytes) -> tuple[Model, ExtensionOptions]:
+    return pickle.loads(common)

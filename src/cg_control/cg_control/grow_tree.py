@@ -3,15 +3,18 @@
     python -m cg_control.grow_tree --goal either --samples 5000 --out tree.npz
 
 Gains of the balance controller, basins and the box of the states are those of the compass gait. A
-seed says what grows, whatever the number of workers.
+seed says what grows, whatever the number of workers, and however often the growth is stopped or
+killed: the same command goes on where it was, from a checkpoint beside the file.
 """
 
 import argparse
+import math
 import multiprocessing
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,21 +22,29 @@ import numpy as np
 
 from cg_control.balance import BalanceSettings, balance_gains
 from cg_control.basin import sample_basin, shipped_basins
+from cg_control.checkpoint import Checkpoint, Keeper
+from cg_control.cluster import Cluster
 from cg_control.extension import Extension, upright_form
-from cg_control.growth import Grower, GrowthOptions, Region
+from cg_control.growth import Counts, Grower, GrowthOptions, Region
 from cg_control.nodes import Nodes
 from cg_control.tree import Tree, TreeError
 from cg_control.tvlqr import Weights, balance_regulator
 from cg_description.paths import model_path
+from cg_dynamics.cluster import ClusterError
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.stop_request import Stopped, stopped_by_signals
+from cg_dynamics.watched_processes import LIMIT, WatchedProcesses
 
 GOALS = {'either': STANCES, 'inner': ('inner',), 'outer': ('outer',)}
 BOX = (0.5, 0.8, 1.5, 4.0)  # rad, rad, rad/s, rad/s: Region
 SWING = 0.3  # rad: amplitude of the swing leg up to which a robot counts as home
 LANDING = WalkOptions(sample_time=0.002, step=0.002, minimum_step=0.1)
+GROWTH = GrowthOptions(at_once=16)
 EVERY = 8.0  # s between lines of progress
+WRITTEN = 10.0  # s between checkpoints, at least
+RECENT = 5  # rounds over which the coverage is counted that they tell
 
 
 def upright_tree(model: Model, legs: Sequence[str] = STANCES) -> Tree:
@@ -72,6 +83,7 @@ class Growing:
 
     def __init__(self, grower: Grower, samples: int):
         self._grower, self._samples, self._began = grower, samples, time.monotonic()
+        self._recent: tuple[Counts, ...] = ()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name='progress', daemon=True)
 
@@ -89,7 +101,28 @@ class Growing:
         return (
             f'grow_tree: {time.monotonic() - self._began:.0f} s: {done} of {self._samples} states '
             f'done, {self._samples - done} left; {counts.grown} branches, '
-            f'{len(self._grower.nodes)} nodes'
+            f'{len(self._grower.nodes)} nodes{self._given_up()}{self._coverage()}'
+        )
+
+    def count(self, counts: Counts) -> None:
+        """Take in what a round came to."""
+        self._recent = (*self._recent, counts)[-RECENT:]
+
+    def _given_up(self) -> str:
+        given_up = self._grower.counts.given_up
+        return f', {given_up} states given up' if given_up else ''
+
+    def _coverage(self) -> str:
+        """An estimate of the share that the tree brings home of what can be brought home."""
+        recent = self._recent
+        drawn, home, new = (
+            sum(getattr(c, name) for c in recent) for name in ('samples', 'covered', 'grown')
+        )
+        if not home + new:
+            return ''
+        return (
+            f'; of the last {drawn} states {home + new} can be brought home, as far as is known, '
+            f'and the tree brought home {100 * home / (home + new):.0f} % of these by itself'
         )
 
     def _run(self) -> None:
@@ -97,7 +130,15 @@ class Growing:
             print(self, file=sys.stderr, flush=True)
 
 
-def grow(model: Model, goal: str, samples: int, seed: int, workers: int = 1) -> Tree:
+def grow(
+    model: Model,
+    goal: str,
+    samples: int,
+    seed: int,
+    executor: Executor | None = None,
+    threads: int = 1,
+    checkpoint: Path | None = None,
+) -> Tree:
     """A tree of so many states, in whole rounds.
 
     Args:
@@ -105,26 +146,64 @@ def grow(model: Model, goal: str, samples: int, seed: int, workers: int = 1) -> 
         goal: 'either', 'inner' or 'outer': the leg on which it is to stand upright.
         samples: Least number of states that are drawn.
         seed: Of all that is drawn.
-        workers: Processes; the tree does not depend on them.
+        executor: Whose workers plan; None plans here. The tree does not depend on it,
+        threads: nor on how many threads simulate.
+        checkpoint: File to go on from, if it is there, and to write every few seconds, and where
+            this ends before the tree is grown, for whatever reason. It stays when it is grown.
+
+    Raises:
+        TreeError: The checkpoint is damaged, or of a tree that was begun otherwise.
     """
-    legs = GOALS[goal]
-    extension = Extension(model, legs, workers=workers)
+    legs, keeper, saved = GOALS[goal], None, None
+    if checkpoint is not None:
+        keeper = Keeper(checkpoint, WRITTEN)
+        if checkpoint.exists():
+            saved = Checkpoint.load(checkpoint, model)
+    extension = Extension(model, legs, executor=executor)
+    grower = Grower(
+        model, upright_tree(model, legs) if saved is None else saved.tree,
+        Region(np.array(BOX)), extension, replace(GROWTH, seed=seed), simulation=LANDING,
+        threads=threads,
+    )  # fmt: skip
+    more = {'goal': goal, 'extension': extension.options}
+    if saved is not None:
+        _require_same(saved, Checkpoint.of(grower, **more), samples, checkpoint)
+        grower = saved.resumed(grower)
     try:
-        grower = Grower(
-            model, upright_tree(model, legs), Region(np.array(BOX)), extension,
-            GrowthOptions(seed=seed, at_once=16), simulation=LANDING, threads=workers,
-        )  # fmt: skip
-        with Growing(grower, samples):
+        with Growing(grower, samples) as growing:
             while grower.counts.samples < samples:
-                grower.round()
+                growing.count(grower.round())
+                if keeper is not None:
+                    keeper.keep(Checkpoint.of(grower, **more))
     finally:
-        extension.close()
+        if keeper is not None:
+            keeper.write()
     told = {
         'command': f'grow_tree --goal {goal} --samples {samples} --seed {seed}',
         'box': list(BOX),
         'counts': vars(grower.counts),
     }
     return replace(grower.tree, provenance={**grower.tree.provenance, **told})
+
+
+def _require_same(
+    saved: Checkpoint, here: Checkpoint, samples: int, path: Path | None
+) -> None:
+    """Refuse to go on from what would not become the tree that is asked for; else say so."""
+    done = saved.counts.samples
+    try:
+        saved.require(here.decided)
+        if done - GROWTH.round_size >= samples:
+            raise TreeError(
+                f'{done} states are drawn already, but asked for are only {samples}; ask for as '
+                'many, or delete the file and begin anew'
+            )
+    except TreeError as error:
+        raise TreeError(f'{path}: {error}') from None
+    print(
+        f'grow_tree: goes on from {path}: {done} of {samples} states are done',
+        file=sys.stderr, flush=True,
+    )  # fmt: skip
 
 
 def main(args: list[str] | None = None) -> int:
@@ -136,19 +215,45 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--goal', choices=sorted(GOALS), default='either', help='leg [either]')
     parser.add_argument('--samples', type=int, default=5000, help='states to draw [5000]')
     parser.add_argument('--seed', type=int, default=0, help='of all that is drawn [0]')
+    parser.add_argument('--workers', type=int, help='local processes [one per core]')
     parser.add_argument(
-        '--workers', type=int, default=multiprocessing.cpu_count(), help='processes [all cores]'
-    )
+        '--scheduler', metavar='ADDRESS',
+        help='plan on the workers of this dask scheduler instead, such as tcp://127.0.0.1:8786',
+    )  # fmt: skip
+    parser.add_argument(
+        '--limit', type=float, default=LIMIT, metavar='S',
+        help='time after which planning for one state is given up, s [%(default)g]',
+    )  # fmt: skip
     parser.add_argument('--out', type=Path, required=True, help='file to write, .npz')
+    parser.add_argument(
+        '--checkpoint', type=Path, metavar='FILE',
+        help='file that a stopped growth goes on from; gone when the tree is grown [OUT.part]',
+    )  # fmt: skip
     options = parser.parse_args(args)
+    checkpoint = options.checkpoint or options.out.with_name(f'{options.out.name}.part')
+    cores = multiprocessing.cpu_count()
     try:
         model = Model.load(model_path(options.model))
-        if options.samples < 1 or options.workers < 1:
-            raise ValueError('--samples and --workers must be 1 or more')
-        if not options.out.absolute().parent.is_dir():
-            raise TreeError(f'{options.out}: there is no such directory')
-        tree = grow(model, options.goal, options.samples, options.seed, options.workers)
-        tree.save(options.out)
+        _require_sound(options, checkpoint)
+        with (
+            stopped_by_signals(),
+            Cluster(options.scheduler, options.limit)
+            if options.scheduler is not None
+            else WatchedProcesses(options.workers or cores, options.limit) as executor,
+        ):
+            tree = grow(
+                model, options.goal, options.samples, options.seed, executor,
+                options.workers or cores, checkpoint,
+            )  # fmt: skip
+            tree.save(options.out)
+            checkpoint.unlink(missing_ok=True)
+    except Stopped as stopped:
+        print(f'grow_tree: {stopped}; {_then(checkpoint)}', file=sys.stderr)
+        return stopped.status
+    except ClusterError as error:
+        then = f'; {_then(checkpoint)}' if checkpoint.exists() else ''
+        print(f'grow_tree: {error}{then}', file=sys.stderr)
+        return 2
     except (ValueError, OSError) as error:
         print(f'grow_tree: {error}', file=sys.stderr)
         return 2
@@ -157,6 +262,28 @@ def main(args: list[str] | None = None) -> int:
         f'branches, upright on the {" or ".join(tree.legs)} leg'
     )
     return 0
+
+
+def _require_sound(options: argparse.Namespace, checkpoint: Path) -> None:
+    """Refuse what cannot be grown or written, before it takes hours."""
+    if options.scheduler is not None and options.workers is not None:
+        raise ValueError('--workers are local processes; leave it out where --scheduler is given')
+    if options.samples < 1 or (options.workers is not None and options.workers < 1):
+        raise ValueError('--samples and --workers must be 1 or more')
+    if not 0 < options.limit < math.inf:
+        raise ValueError(f'--limit is {options.limit:g} s; it must be positive and finite')
+    for path in (options.out, checkpoint):
+        if not path.absolute().parent.is_dir():
+            raise TreeError(f'{path}: there is no such directory')
+    if checkpoint.absolute() == options.out.absolute():
+        raise ValueError('--checkpoint and --out must be two files')
+
+
+def _then(checkpoint: Path) -> str:
+    """How to go on."""
+    if not checkpoint.exists():
+        return 'no round is finished, so the same command begins anew'
+    return f'the tree so far is in {checkpoint}, and the same command goes on from there'
 
 
 if __name__ == '__main__':

@@ -83,6 +83,11 @@ class Branch:
 
 
 @dataclass(frozen=True)
+class GivenUp:
+    """In place of a branch: planning for this state hung, or ended its process."""
+
+
+@dataclass(frozen=True)
 class GrowthOptions:
     """How a tree is grown.
 
@@ -118,9 +123,10 @@ class Counts:
     grown: int = 0
     rejected: int = 0
     rollouts: int = 0
+    given_up: int = 0
 
 
-Extend = Callable[[Nodes, np.ndarray, np.ndarray], Sequence[Branch | None]]
+Extend = Callable[[Nodes, np.ndarray, np.ndarray], Sequence[Branch | GivenUp | None]]
 
 
 @dataclass
@@ -131,7 +137,8 @@ class Grower:
         model: The robot.
         tree: So far.
         region: Where states are drawn.
-        extend: (nodes, legs (n,), states (n, nx)) -> a branch for each state or None.
+        extend: (nodes, legs (n,), states (n, nx)) -> for each state a branch, None if there is
+            none, or that it was given up.
         options: How.
         settings: The law that follows the tree.
         simulation: Options of the rollouts.
@@ -264,7 +271,9 @@ class Grower:
         self.counts.planned += len(leg)
         grown = False
         for row, branch in enumerate(self.extend(self.nodes, leg, x)):
-            if branch is not None and self._grow(branch, x[row]):
+            if isinstance(branch, GivenUp):
+                self.counts.given_up += 1
+            elif branch is not None and self._grow(branch, x[row]):
                 self._probe(rng)
                 self.counts.grown += 1
                 grown = True

@@ -1,13 +1,9 @@
 """A grown tree and its file: nodes, the goal regions where the balance controller takes over.
 
-A file is a zip archive of plain arrays (numpy's .npz, no pickle), one a field of `Nodes`, and one
-text with format, model hash and provenance. It is read with care: size and shape of every array
-are looked at before it is unpacked, every index and number before it is used.
+A file is an archive (archive.py) of plain arrays, one a field of `Nodes`, and a header with
+format, model hash and provenance. Every index and number is looked at before it is used.
 """
 
-import io
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from cg_control.archive import read_archive, write_archive
 from cg_control.nodes import ARRAYS, Nodes
 from cg_control.trajectory import TrajectoryError
-from cg_description.model_file import write_atomically
-from cg_description.reading import parse_json
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
 FORMAT = 'cg_tree/1'
 LARGEST_FILE = 1 << 30  # bytes, unpacked
 MOST_NODES = 1_000_000
-HEADER = 'header'
+MEMBERS = (*ARRAYS, 'goal')
 INTEGERS = ('stance', 'next', 'landing', 'branch')
 
 
@@ -68,17 +63,19 @@ class Tree:
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
-        header = {
-            'format': FORMAT,
+        write_archive(path, {'format': FORMAT, **self.header()}, self.arrays())
+
+    def header(self) -> dict[str, Any]:
+        """What is no array, as JSON values."""
+        return {
             'model_hash': self.nodes.model_hash,
             'compensate': self.nodes.compensate,
             'provenance': dict(self.provenance),
         }
-        text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8)
-        arrays: dict[str, Any] = {name: getattr(self.nodes, name) for name in ARRAYS}
-        file = io.BytesIO()
-        np.savez_compressed(file, **(arrays | {HEADER: text, 'goal': self.goal}))
-        write_atomically(path, file.getvalue())
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of the nodes and the goal, by name."""
+        return {name: getattr(self.nodes, name) for name in ARRAYS} | {'goal': self.goal}
 
     @classmethod
     def load(cls, path: str | Path, model: Model | None = None) -> 'Tree':
@@ -92,8 +89,7 @@ class Tree:
             TreeError: for a file that is none, a damaged one, or one of another model.
         """
         try:
-            arrays = _unpacked(Path(path))
-            tree = cls._from_arrays(arrays)
+            tree = cls.of(*read_archive(path, MEMBERS, FORMAT, 'a tree', LARGEST_FILE, TreeError))
             if model is not None:
                 tree.require_model(model)
         except TreeError as error:
@@ -101,8 +97,13 @@ class Tree:
         return tree
 
     @classmethod
-    def _from_arrays(cls, arrays: dict[str, np.ndarray]) -> 'Tree':
-        header = _header(arrays)
+    def of(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> 'Tree':
+        """The tree of what `header` and `arrays` gave, or of what somebody else wrote.
+
+        Raises:
+            TreeError: It is no tree.
+        """
+        _require_kinds(header, arrays)
         n, nx = len(arrays['stance']), arrays['x0'].shape[-1]
         if not 1 <= n <= MOST_NODES:
             raise TreeError(f'{n} nodes; allowed are 1 to {MOST_NODES}')
@@ -127,49 +128,15 @@ class Tree:
         return cls(nodes, arrays['goal'], header.get('provenance') or {})
 
 
-def _unpacked(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file, each of them plain, none of them too large."""
-    names = (HEADER, *ARRAYS, 'goal')
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {info.filename: info for info in archive.infolist()}
-            missing = [name for name in names if f'{name}.npy' not in members]
-            if missing:
-                raise TreeError(f'not a tree: {", ".join(missing)} is missing')
-            size = sum(members[f'{name}.npy'].file_size for name in names)
-            if size > LARGEST_FILE:
-                raise TreeError(f'{size} bytes unpacked; allowed are {LARGEST_FILE}')
-            return {
-                name: np.lib.format.read_array(
-                    io.BytesIO(archive.read(f'{name}.npy')), allow_pickle=False
-                )
-                for name in names
-            }
-    except OSError as error:
-        raise TreeError(error.strerror or str(error)) from None
-    except TreeError:
-        raise
-    # Whatever a damaged archive makes zipfile, zlib or numpy raise.
-    except Exception as error:
-        raise TreeError(f'not a tree, or damaged: {error}') from None
-
-
-def _header(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    try:
-        text = arrays[HEADER].tobytes().decode()
-    except UnicodeDecodeError:
-        raise TreeError('header is not UTF-8') from None
-    header = parse_json(text, HEADER, TreeError)
-    if not isinstance(header, dict) or header.get('format') != FORMAT:
-        raise TreeError(f'not a tree: format must be {FORMAT!r}')
+def _require_kinds(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse a header that lacks something, and arrays of another kind."""
     if not isinstance(header.get('model_hash'), str) or 'compensate' not in header:
         raise TreeError('header lacks model_hash or compensate')
-    for name in (*ARRAYS, 'goal'):
+    for name in MEMBERS:
         kind = arrays[name].dtype.kind
         allowed = 'i' if name in INTEGERS else 'b' if name == 'late' else 'f'
         if kind != allowed or arrays[name].ndim == 0:
             raise TreeError(f'{name} holds {arrays[name].dtype}, expected kind {allowed!r}')
-    return header
 
 
 def _require_goal(goal: np.ndarray) -> None:
