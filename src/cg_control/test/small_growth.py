@@ -35,12 +35,13 @@ def make_small(monkeypatch) -> None:
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen:
-    """The command `grow_tree` with these words, in a process of its own."""
+    """The command `grow_tree` with these words, in a process and a group of its own."""
     script = folder / 'small_grow_tree.py'
     script.write_text(PROGRAM)
     return subprocess.Popen(
         [sys.executable, str(script), *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+        start_new_session=True,
         # Jobs in the background of a shell ignore SIGINT, and all that they start.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Growth that is stopped, or killed, and goes on: the same tree to the bit as in one go."""
 
 import io
+import os
 import signal
 import time
 import zipfile
@@ -241,7 +242,7 @@ def test_a_signal_ends_growth_with_a_checkpoint(robot, in_one_go, tmp_path, numb
              '--checkpoint', str(part)]  # fmt: skip
     process = started(tmp_path, *words)
     written_anew(part, b'', process)
-    process.send_signal(number)
+    os.killpg(process.pid, number)  # as a terminal does it: to those that plan, too
     said, err = process.communicate(timeout=LONG)
     assert (process.returncode, said) == (128 + number, '')
     assert err.splitlines()[-1] == (
