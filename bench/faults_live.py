@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -45,6 +46,7 @@ TORQUE = 7.0  # N m of a command that must not act
 GOOD = 0.5  # N m of one that must
 AHEAD = {'15 ms': 0.015, '3 s': 3.0, '1 h': 3600.0}  # s
 FLOOD = 1.0  # s
+QUIET = 50  # samples without torque after which the gate has heard of a flood
 TARGET = Path(__file__).resolve().parent / 'results/faults_live.md'
 
 
@@ -54,6 +56,8 @@ class Ear(Node):
     def __init__(self):
         super().__init__('ear')
         self.applied: list[tuple[int, float]] = []
+        self.said: dict[str, str] = {}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self.on_diagnostics, 10)
         self.create_subscription(JointState, '/applied_torque', self.on_applied, MACHINE_QOS)
         self.executor_ = EventsExecutor()
         self.executor_.add_node(self)
@@ -61,6 +65,10 @@ class Ear(Node):
     def on_applied(self, message: JointState) -> None:
         """Keep stamp and torque of a sample."""
         self.applied.append((to_nanoseconds(message.header.stamp), message.effort[0]))
+
+    def on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Keep what each node said last."""
+        self.said |= {status.name: status.message for status in message.status}
 
     def spin(self, seconds: float) -> None:
         """Listen for so long."""
@@ -180,7 +188,10 @@ def time_to_zero(loop: Loop, since_ns: int, length: float) -> float:
 def back_after(loop: Loop) -> float | None:
     """S until most samples have torque again."""
     began, loop.ear.applied[:] = time.monotonic(), loop.ear.applied[-1:]
-    return time.monotonic() - began if loop.ear.until(loop.ear.driven) else None
+    if loop.ear.until(loop.ear.driven):
+        return time.monotonic() - began
+    print(f'no torque: {loop.ear.said}', flush=True)
+    return None
 
 
 def kill(loop: Loop, victim: str) -> Outcome:
@@ -250,7 +261,9 @@ def flood(loop: Loop, topic: str) -> Outcome:
     """A process publishes on a topic of the torque as fast as it can."""
     shouter = subprocess.Popen([sys.executable, __file__, '--shout', topic])
     loop.ear.until(lambda: loop.ear.count_publishers(topic) == 2)
-    loop.ear.spin(0.5)  # the gate has heard of it, too
+    # The gate hears of it in its own time; until then the controller's torque acts.
+    ear = loop.ear
+    ear.until(lambda: not any(torque for _, torque in ear.applied[-QUIET:]), 5.0)
     now = loop.ear.applied[-1][0]
     loop.ear.spin(FLOOD)
     rows = after(loop, now)
