@@ -40,6 +40,7 @@ class RecoverOptions:
     Attributes:
         robot: Model file of the simulated machine.
         model: Model file of observer, tree and controller.
+        grown_for: Model file that the tree was grown for, where `model` knows more by now.
         tree: Name or file.
         start: 'funnel': a state that the tree claims, drawn by the seed; 'upright'.
         stance: Leg that stands at an upright start.
@@ -53,6 +54,7 @@ class RecoverOptions:
 
     robot: str = NOMINAL_MODEL
     model: str = ''
+    grown_for: str = ''
     tree: str = 'compass_gait_mit'
     start: str = 'funnel'
     stance: str = 'inner'
@@ -91,9 +93,10 @@ def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
     """
     rate = {'sample_rate_hz': 500.0}
     path = tree_path(options.tree)
+    grown_for = options.grown_for or options.model
     stance, x = options.stance, np.zeros(4)
     if options.start == 'funnel':
-        model = Model.load(model_path(options.model or NOMINAL_MODEL))
+        model = Model.load(model_path(grown_for or NOMINAL_MODEL))
         stance, x = claimed_state(Tree.load(path, model), options.seed)
     machine: dict[str, Any] = {
         'model_file': options.robot,
@@ -116,10 +119,11 @@ def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
         MACHINE: NodeOf('cg_hardware', 'simulation_node', machine),
         'tree_server': NodeOf(
             'cg_control', 'tree_server_node',
-            {'model_file': options.model, 'tree': str(path)},
+            {'model_file': grown_for, 'tree': str(path)},
         ),
         'tree_controller': NodeOf(
-            'cg_control', 'tree_controller_node', {'model_file': options.model, **rate},
+            'cg_control', 'tree_controller_node',
+            {'model_file': options.model, 'grown_for': grown_for, **rate},
             (('/torque_command', '/torque_request'),),
         ),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
@@ -142,6 +146,9 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog='recover_balance', description=__doc__)
     parser.add_argument('--robot', default=default.robot, help='simulated: a model file or a name')
     parser.add_argument('--model', default='', help='of observer, tree and controller: the same')
+    parser.add_argument(
+        '--grown-for', default='', help='model of the tree, where --model knows more [--model]'
+    )
     parser.add_argument(
         '--tree', default=default.tree, help=f'a file or a name [{default.tree}]'
     )

@@ -22,6 +22,7 @@ DEFAULT = RecoverOptions()
 ARGUMENTS = {
     'robot': (DEFAULT.robot, 'model of the simulated robot: a file or a name', None),
     'model': ('', 'model of observer, tree and controller; empty: nominal', None),
+    'grown_for': ('', 'model of the tree, where model knows more; empty: the same', None),
     'tree': (DEFAULT.tree, 'tree that is followed: a file or a name', None),
     'start': (DEFAULT.start, 'funnel: a state that the tree claims; upright', list(STARTS)),
     'stance': ('inner', 'leg that stands at an upright start', list(STANCES)),
@@ -39,7 +40,7 @@ def start(given: dict[str, str]) -> list:
     options = RecoverOptions(
         **{
             name: given[name]
-            for name in ('robot', 'model', 'tree', 'start', 'stance', 'mode', 'bag')
+            for name in ('robot', 'model', 'grown_for', 'tree', 'start', 'stance', 'mode', 'bag')
         },
         **{name: number(given, name) for name in ('duration', 'epsilon')},
         seed=number(given, 'seed', int),

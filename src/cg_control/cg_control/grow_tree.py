@@ -27,11 +27,11 @@ from cg_control.cluster import Cluster
 from cg_control.extension import Extension, upright_form
 from cg_control.growth import Counts, Grower, GrowthOptions, Region
 from cg_control.nodes import Nodes
+from cg_control.preview import CHAMPIONS, LANDING, Preview, champions, pruned
 from cg_control.tree import Tree, TreeError
 from cg_control.tvlqr import Weights, balance_regulator
 from cg_description.paths import model_path
 from cg_dynamics.cluster import ClusterError
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_dynamics.stop_request import Stopped, stopped_by_signals
@@ -40,11 +40,12 @@ from cg_dynamics.watched_processes import LIMIT, WatchedProcesses
 GOALS = {'either': STANCES, 'inner': ('inner',), 'outer': ('outer',)}
 BOX = (0.5, 0.8, 1.5, 4.0)  # rad, rad, rad/s, rad/s: Region
 SWING = 0.3  # rad: amplitude of the swing leg up to which a robot counts as home
-LANDING = WalkOptions(sample_time=0.002, step=0.002, minimum_step=0.1)
 GROWTH = GrowthOptions(at_once=16)
 EVERY = 8.0  # s between lines of progress
 WRITTEN = 10.0  # s between checkpoints, at least
 RECENT = 5  # rounds over which the coverage is counted that they tell
+SAMPLE = 3000  # states that the champions are chosen by
+CHAMPIONSHIP = 1 << 32  # in place of the number of a round
 
 
 def upright_tree(model: Model, legs: Sequence[str] = STANCES) -> Tree:
@@ -115,9 +116,11 @@ class Growing:
     def _coverage(self) -> str:
         """An estimate of the share that the tree brings home of what can be brought home."""
         recent = self._recent
-        drawn, home, new = (
-            sum(getattr(c, name) for c in recent) for name in ('samples', 'covered', 'grown')
+        drawn, claimed, previewed, new = (
+            sum(getattr(c, name) for c in recent)
+            for name in ('samples', 'covered', 'previewed', 'grown')
         )
+        home = claimed + previewed
         if not home + new:
             return ''
         return (
@@ -138,6 +141,7 @@ def grow(
     executor: Executor | None = None,
     threads: int = 1,
     checkpoint: Path | None = None,
+    branches: int = 0,
 ) -> Tree:
     """A tree of so many states, in whole rounds.
 
@@ -150,6 +154,7 @@ def grow(
         threads: nor on how many threads simulate.
         checkpoint: File to go on from, if it is there, and to write every few seconds, and where
             this ends before the tree is grown, for whatever reason. It stays when it is grown.
+        branches: Keep so many of each leg, the champions, and those that they end on; 0: all.
 
     Raises:
         TreeError: The checkpoint is damaged, or of a tree that was begun otherwise.
@@ -178,12 +183,19 @@ def grow(
     finally:
         if keeper is not None:
             keeper.write()
+    tree = grower.tree
+    sample = grower.region.draw(np.random.default_rng([seed, CHAMPIONSHIP]), SAMPLE)
+    order = champions(
+        Preview(tree, model, threads=threads), *sample, count=max(branches, CHAMPIONS)
+    )
+    tree = pruned(tree, order) if branches else replace(tree, champions=order[:, :CHAMPIONS])
     told = {
-        'command': f'grow_tree --goal {goal} --samples {samples} --seed {seed}',
+        'command': f'grow_tree --goal {goal} --samples {samples} --seed {seed}'
+        f' --branches {branches}',
         'box': list(BOX),
         'counts': vars(grower.counts),
     }
-    return replace(grower.tree, provenance={**grower.tree.provenance, **told})
+    return replace(tree, provenance={**tree.provenance, **told})
 
 
 def _require_same(
@@ -214,6 +226,10 @@ def main(args: list[str] | None = None) -> int:
     )
     parser.add_argument('--goal', choices=sorted(GOALS), default='either', help='leg [either]')
     parser.add_argument('--samples', type=int, default=5000, help='states to draw [5000]')
+    parser.add_argument(
+        '--branches', type=int, default=0,
+        help='keep so many of each leg, those that bring most states home [0: all]',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, default=0, help='of all that is drawn [0]')
     parser.add_argument('--workers', type=int, help='local processes [one per core]')
     parser.add_argument(
@@ -243,7 +259,7 @@ def main(args: list[str] | None = None) -> int:
         ):
             tree = grow(
                 model, options.goal, options.samples, options.seed, executor,
-                options.workers or cores, checkpoint,
+                options.workers or cores, checkpoint, options.branches,
             )  # fmt: skip
             tree.save(options.out)
             checkpoint.unlink(missing_ok=True)
@@ -268,6 +284,8 @@ def _require_sound(options: argparse.Namespace, checkpoint: Path) -> None:
     """Refuse what cannot be grown or written, before it takes hours."""
     if options.scheduler is not None and options.workers is not None:
         raise ValueError('--workers are local processes; leave it out where --scheduler is given')
+    if options.branches < 0:
+        raise ValueError(f'--branches is {options.branches}; it must be 0 (all) or more')
     if options.samples < 1 or (options.workers is not None and options.workers < 1):
         raise ValueError('--samples and --workers must be 1 or more')
     if not 0 < options.limit < math.inf:

@@ -24,17 +24,18 @@ import numpy as np
 from cg_control.levels import Levels
 from cg_control.lookup import Lookup
 from cg_control.nodes import Nodes
+from cg_control.preview import AT_HOME, LANDING, Preview
 from cg_control.rollouts import Outcome, Rollouts, follow
 from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tree import Tree
+from cg_dynamics.batch import WIDTH
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 
 MOST_CLAIMS = 12  # of one state, after which it counts as unclaimed
 MOST_LANDINGS = 6  # of a robot whose foot lands where no impact is planned
 PROBE_SHELLS = 8
-AT_HOME = 3.0  # s that the balance controller may take beyond the end of the motion
 VISITS = 512  # nodes that a rollout may come by
 
 
@@ -96,6 +97,8 @@ class GrowthOptions:
         round_size: States drawn at a time.
         falsifiers: So many times as many states are drawn besides, whose claims are tried too, but
             which are not planned for: a claim is tried a hundred times faster than planned.
+        dense: The first so many states are planned for unless a funnel holds them, later ones
+            only if no entry brings them home either: branches that begin close by bring home more.
         at_once: States planned for before the others of a round are looked up again.
         probes: States drawn around each node of a new branch.
         probe_costs: Least and largest cost at which they are drawn.
@@ -105,6 +108,7 @@ class GrowthOptions:
     seed: int = 0
     round_size: int = 512
     falsifiers: int = 8
+    dense: int = 8192
     at_once: int = 8
     probes: int = 16
     probe_costs: tuple[float, float] = (1e-2, 1e2)
@@ -119,6 +123,7 @@ class Counts:
     covered: int = 0
     false_claims: int = 0
     unclaimed: int = 0
+    previewed: int = 0
     planned: int = 0
     grown: int = 0
     rejected: int = 0
@@ -153,7 +158,7 @@ class Grower:
     extend: Extend
     options: GrowthOptions = field(default_factory=GrowthOptions)
     settings: TrackingSettings = field(default_factory=TrackingSettings)
-    simulation: WalkOptions | None = None
+    simulation: WalkOptions = LANDING
     threads: int = 1
     counts: Counts = field(default_factory=Counts)
     rounds: int = 0
@@ -176,14 +181,36 @@ class Grower:
         open_ = self.look_up(leg, x)
         self.counts.samples += len(leg)
         self.counts.unclaimed += len(open_)
+        dense = self.counts.samples <= self.options.dense
+        if not dense:
+            open_ = self._not_brought_home(open_, leg, x)
         while len(open_):
             now, open_ = open_[: self.options.at_once], open_[self.options.at_once :]
+            last = int(self.nodes.branch.max())
             grown = self._plan_for(leg[now], x[now], rng)
-            if grown and len(open_):
+            if not grown or not len(open_):
+                continue
+            if dense:
                 open_ = open_[self.look_up(leg[open_], x[open_])]
+            else:
+                entries = self.nodes.entries
+                new = entries[self.nodes.branch[entries] > last]
+                open_ = self._not_brought_home(open_, leg, x, new)
         self._falsify(rng)
         self.rounds += 1
         return Counts(**{k: v - getattr(before, k) for k, v in vars(self.counts).items()})
+
+    def _not_brought_home(
+        self, rows: np.ndarray, leg: np.ndarray, x: np.ndarray, entries: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Those of the rows that a preview brings home from none of its entries, or of these."""
+        preview = Preview(
+            self.tree, self.model, self.settings, self.simulation, nearest=2 * WIDTH,
+            threads=self.threads,
+        )  # fmt: skip
+        home = preview.choose(leg[rows], x[rows], entries) >= 0
+        self.counts.previewed += int(home.sum())
+        return rows[~home]
 
     def _falsify(self, rng: np.random.Generator) -> None:
         """Try what the tree claims of more states."""

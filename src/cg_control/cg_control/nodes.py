@@ -269,6 +269,34 @@ class Nodes:
         )
         return _concatenated([self, moved])
 
+    def pruned(self, branches: np.ndarray) -> tuple['Nodes', np.ndarray]:
+        """The roots, these branches and those they end on: the tree, and where its nodes went.
+
+        Returns:
+            The smaller tree, and the new index of each node, -1 for those that are gone, (n,).
+        """
+        keep = np.isin(self.branch, branches) | (self.branch == 0)
+        while True:
+            # Where a kept node leads, by time or by landing, is kept with its whole branch.
+            led = np.concatenate([self.next[keep], self.landing[keep]])
+            more = keep | np.isin(self.branch, self.branch[led[led >= 0]])
+            if (more == keep).all():
+                break
+            keep = more
+        place = np.where(keep, np.cumsum(keep) - 1, -1)
+        rows = self._rows(np.flatnonzero(keep))
+        moved = {
+            name: np.where(old < 0, -1, place[old]).astype(np.int32)
+            for name, old in (('next', rows.next), ('landing', rows.landing))
+        }
+        return replace(rows, **moved), place
+
+    @functools.cached_property
+    def entries(self) -> np.ndarray:
+        """The roots and the first node of every trajectory: where motions begin, shape (m,)."""
+        _, first = np.unique(self.branch, return_index=True)
+        return np.union1d(first, np.flatnonzero(self.planned < 0))
+
     @property
     def impact(self) -> np.ndarray:
         """Whether an impact is planned at a node, shape (n,)."""

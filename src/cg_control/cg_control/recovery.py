@@ -7,16 +7,19 @@ At every measurement, in this order:
     2. It follows its node as long as the funnel there holds it. It goes over to the node at
        which its state is least deep, if it has left its funnel, or if it is so much less deep
        there and home is not further.                                                    (SWITCH)
-    3. Outside every funnel there is no torque, until a funnel holds the state again.    (OUTSIDE)
+    3. Where no funnel holds it, the tree is previewed (preview.py): the robot stays on its way
+       if that brings it home in simulation, or goes over to an entry that does.       (PREVIEW)
+    4. Where nothing brings it home there is no torque, until something does.          (OUTSIDE)
 
 Nothing is planned meanwhile: what a push does to the state is answered by another node. A foot
 that lands where no impact was planned is a state like any other.
 
 *Hysteresis.* A robot is in a funnel, or in the basin, until its depth there is `hold`; it enters
-at 1. A rival must be less deep by `margin`. The torque ends when no funnel has held the state for
+at 1. A rival must be less deep by `margin`. The torque ends when nothing has held the state for
 `patience`. So noise at the edge of a funnel, or between two nodes, changes nothing. `hold` and
 `patience` are more than that: who comes by a node further out than rho often comes home, for rho
-is where one in a hundred does not, and from node to node it is ragged (levels.py).
+is where one in a hundred does not, and from node to node it is ragged (levels.py). With previews
+funnels need neither `hold` nor `margin`: the way that the robot is on is simulated first.
 """
 
 import collections
@@ -28,6 +31,7 @@ import numpy as np
 
 from cg_control.balance import BALANCING, IDLE, BalanceController, BalanceSettings, Command
 from cg_control.lookup import Claim, Lookup
+from cg_control.preview import Preview
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
 from cg_dynamics.model import Model
@@ -36,6 +40,7 @@ from cg_dynamics.settings import setting
 
 FOLLOWING, OUTSIDE = 'following', 'outside'
 KEPT = 5000  # look-ups whose time is remembered
+STAY, NOWHERE = -1, -2  # in place of a node to go over to
 
 
 @dataclass(frozen=True)
@@ -43,11 +48,11 @@ class RecoverySettings(BalanceSettings):
     """Parameters of the controller that follows a tree."""
 
     fall_angle: float = setting(
-        0.55, 'lean of the stance leg beyond which no funnel is believed', unit='rad',
+        0.55, 'lean of the stance leg beyond which nothing is followed', unit='rad',
         minimum=0.05, maximum=1.5, live=True,
     )  # fmt: skip
     largest_swing: float = setting(
-        2.2, 'angle of the swing leg beyond which no funnel is believed', unit='rad',
+        3.0, 'angle of the swing leg beyond which nothing is followed', unit='rad',
         minimum=0.1, maximum=3.1, live=True,
     )  # fmt: skip
     remedy: str = setting(
@@ -63,17 +68,24 @@ class RecoverySettings(BalanceSettings):
         maximum=10.0, live=True,
     )  # fmt: skip
     hold: float = setting(
-        4.0, 'depth at which the robot leaves the funnel or the basin that it is in; it enters '
-        'at 1', minimum=1.0, maximum=1e6, live=True,
+        4.0, 'depth at which the robot leaves the basin that it is in and, without previews, the '
+        'funnel; it enters at 1', minimum=1.0, maximum=1e6, live=True,
     )  # fmt: skip
     patience: float = setting(
-        0.03, 'time beyond `hold`, and in no other funnel, after which the torque ends', unit='s',
+        0.03, 'time for which nothing has held the state after which the torque ends', unit='s',
         minimum=0.0, maximum=1.0, live=True,
     )  # fmt: skip
     margin: float = setting(
         2.0, 'by how much less deep a state must be elsewhere for the robot to go over',
         minimum=0.0, maximum=1e6, live=True,
     )  # fmt: skip
+    preview: bool = setting(
+        True, 'simulate where the tree leads from states that no funnel holds, and follow what '
+        'brings the robot home', live=True,
+    )  # fmt: skip
+    preview_period: float = setting(
+        0.01, 'for how long a preview counts', unit='s', minimum=0.001, maximum=1.0, live=True
+    )
 
     @property
     def tracking(self) -> TrackingSettings:
@@ -89,24 +101,31 @@ class ReadyTree:
         tree: The tree.
         lookup: Of its funnels.
         tracker: Of its nodes.
+        preview: Of its entries, on the robot as it is known.
     """
 
     tree: Tree
     lookup: Lookup
     tracker: Tracker
+    preview: Preview
 
     @classmethod
     def of(cls, tree: Tree, model: Model) -> 'ReadyTree':
         """Make everything.
 
+        Args:
+            tree: The tree.
+            model: The robot as it is known, which may be more than when the tree was grown.
+
         Raises:
-            TreeError: The tree was grown for another model.
+            ValueError: The robot cannot be previewed: it has an input delay, say.
         """
-        tree.require_model(model)
         nodes = tree.nodes
-        ready = cls(tree, Lookup(nodes), Tracker(nodes, model))
-        # Properties that are worked out once, when they are first asked for.
+        preview = Preview(tree, model)
+        ready = cls(tree, Lookup(nodes), Tracker(nodes, model), preview)
+        # What is worked out once, when it is first asked for; the rollouts are compiled.
         _ = nodes.costs, nodes.to_go, nodes.steps
+        preview.choose(nodes.stance[:1], nodes.x0[:1])
         return ready
 
 
@@ -125,6 +144,7 @@ class TreeController:
             where none is said (an impact is due). Inside if 1 or less.
         switches: How often the robot has gone over to another node while it followed one.
         lookup_times: Of the last look-ups, s.
+        preview_times: Of the last previews, s.
     """
 
     def __init__(self, balance: BalanceController, settings: RecoverySettings):
@@ -133,7 +153,10 @@ class TreeController:
         self.depth, self.switches = math.inf, 0
         self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._ready: ReadyTree | None = None
+        self.preview_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._stance, self._torque, self._held_ns = '', 0.0, 0
+        self._previewed_ns: int | None = None
+        self._verdict = NOWHERE
 
     @property
     def tree(self) -> Tree | None:
@@ -162,15 +185,15 @@ class TreeController:
         """New settings from the next step on."""
         self.settings = settings
         if self._ready is not None:
-            self._ready.tracker.settings = settings.tracking
+            self.take(self._ready)
 
     def take(self, ready: ReadyTree | None) -> None:
         """Follow another tree from the next step on, or none."""
-        self._ready = ready
-        if self.mode == FOLLOWING:
+        if self.mode == FOLLOWING and self._ready is not ready:
             self._rest(IDLE)
+        self._ready = ready
         if ready is not None:
-            ready.tracker.settings = self.settings.tracking
+            ready.tracker.settings = ready.preview.settings = self.settings.tracking
 
     def interrupt(self) -> None:
         """States were missing: what was known of the motion is void."""
@@ -251,23 +274,66 @@ class TreeController:
         if self.mode == FOLLOWING:
             torque = tracker.torque(stamp_ns * 1e-9, stance, x)
             here = self._depth_here(stance, x)
-        lost = here > self.settings.hold  # NaN, where no depth is said, is not
-        if not lost:
-            self._held_ns = stamp_ns
-        if lost and best.depth > 1.0 and self._waited(stamp_ns, here):
+        onto = self._onto(stamp_ns, stance, x, best, here)
+        if onto == NOWHERE and self._waited(stamp_ns, here):
             self._rest(OUTSIDE)
             self.depth = best.depth
             return Command(0.0, OUTSIDE, f'outside every funnel: depth {best.depth:.3g}')
-        nearer = best.depth < here - self.settings.margin and self._nearer(best.node)
-        if nearer or (lost and best.depth <= 1.0):
+        if onto != NOWHERE:
+            self._held_ns = stamp_ns
+        if onto >= 0:
             self.switches += self.mode == FOLLOWING
-            tracker.begin(best.node)
-            self.entered, self._held_ns = best.node, stamp_ns
-            torque, here = tracker.torque(stamp_ns * 1e-9, stance, x), best.depth
+            tracker.begin(onto)
+            self.entered = onto
+            torque = tracker.torque(stamp_ns * 1e-9, stance, x)
+            here = self._depth_here(stance, x)
         self.mode, self.node, self.depth = FOLLOWING, tracker.node, here
         limit = self.torque_limit
         self._torque = min(max(torque, -limit), limit)
         return Command(self._torque, FOLLOWING)
+
+    def _onto(
+        self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim, here: float
+    ) -> int:
+        """The node to go over to, STAY or NOWHERE, by (SWITCH) and (PREVIEW)."""
+        if self.settings.preview:
+            if here > 1.0:  # NaN, where no depth is said, is not
+                return self._previewed(stamp_ns, stance, x, best)
+            return STAY
+        if best.depth < here - self.settings.margin and self._nearer(best.node):
+            return best.node
+        if here > self.settings.hold:
+            return best.node if best.depth <= 1.0 else NOWHERE
+        return STAY
+
+    def _previewed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> int:
+        assert self._ready is not None
+        preview, tracker = self._ready.preview, self._ready.tracker
+        underway = self.mode == FOLLOWING and not tracker.left(stance)
+        since = None if self._previewed_ns is None else (stamp_ns - self._previewed_ns) * 1e-9
+        if since is not None and 0.0 <= since < self.settings.preview_period:
+            if underway:
+                return self._verdict
+            if self.mode == OUTSIDE:
+                return NOWHERE
+        began = time.perf_counter()
+        leg = np.array([STANCES.index(stance)])
+        nodes = preview.candidates(leg, x[None])[0]
+        nodes = nodes[nodes >= 0]
+        if best.depth <= 1.0:
+            nodes = np.concatenate([[best.node], nodes])
+        elapsed = np.zeros(len(nodes))
+        if underway:
+            # At a root time stands still, whatever the clock says.
+            now = 0.0 if tracker.done else tracker.elapsed
+            nodes = np.concatenate([[tracker.node], nodes])
+            elapsed = np.concatenate([[now], elapsed])
+        first = preview.first_home(nodes, np.repeat(x[None], len(nodes), axis=0), elapsed)
+        self._previewed_ns, self._verdict = stamp_ns, STAY if first >= 0 else NOWHERE
+        self.preview_times.append(time.perf_counter() - began)
+        if first < 0 or (underway and first == 0):
+            return self._verdict
+        return int(nodes[first])
 
     def _waited(self, stamp_ns: int, here: float) -> bool:
         """Whether the robot gives its node up. One whose plan is over has no choice."""

@@ -342,20 +342,28 @@ def rollout_library(robot: Model, compensated: Model | None) -> ctypes.CDLL | No
     """
     if compiler() is None:
         return None
+    key = robot.hash, compensated and compensated.hash
+    if key not in _libraries:
+        _libraries[key] = _built(robot, compensated)
+    return _libraries[key]
+
+
+def _built(robot: Model, compensated: Model | None) -> ctypes.CDLL | None:
     try:
         source = rollout_source(robot, compensated)
     except UnsupportedError as error:
         log.warning('rollouts run one by one: %s', error)
         return None
-    if source not in _libraries:
+    if source not in _by_source:
         library = ctypes.CDLL(str(shared_library(source, FLAGS)))
         library.cgr_follow.argtypes = [ctypes.POINTER(_Job), ctypes.c_long, ctypes.c_long]
         library.cgr_follow.restype = ctypes.c_int
-        _libraries[source] = library
-    return _libraries[source]
+        _by_source[source] = library
+    return _by_source[source]
 
 
-_libraries: dict[str, ctypes.CDLL] = {}
+_libraries: dict[tuple[str, str | None], ctypes.CDLL | None] = {}
+_by_source: dict[str, ctypes.CDLL] = {}
 _sources: dict[tuple, str] = {}
 
 

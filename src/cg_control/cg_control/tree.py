@@ -17,10 +17,10 @@ from cg_control.trajectory import TrajectoryError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
-FORMAT = 'cg_tree/1'
+FORMAT = 'cg_tree/2'
 LARGEST_FILE = 1 << 30  # bytes, unpacked
 MOST_NODES = 1_000_000
-MEMBERS = (*ARRAYS, 'goal')
+MEMBERS = (*ARRAYS, 'goal', 'champions')
 INTEGERS = ('stance', 'next', 'landing', 'branch')
 
 
@@ -37,11 +37,14 @@ class Tree:
         goal: Region x' F x <= 1 of each stance leg that counts as home, shape (2, nx, nx), NaN on
             a leg that is no goal: an ellipsoid inside the basin of the balance controller.
         provenance: How it was grown. JSON values.
+        champions: Entries that a preview tries whatever the state, of each stance leg, those that
+            bring most states home first; -1 where there are no more: shape (2, m).
     """
 
     nodes: Nodes
     goal: np.ndarray
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    champions: np.ndarray = field(default_factory=lambda: np.zeros((len(STANCES), 0), np.int32))
 
     @property
     def legs(self) -> tuple[str, ...]:
@@ -74,8 +77,9 @@ class Tree:
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the nodes and the goal, by name."""
-        return {name: getattr(self.nodes, name) for name in ARRAYS} | {'goal': self.goal}
+        """The arrays of the nodes, the goal and the champions, by name."""
+        own = {'goal': self.goal, 'champions': self.champions}
+        return {name: getattr(self.nodes, name) for name in ARRAYS} | own
 
     @classmethod
     def load(cls, path: str | Path, model: Model | None = None) -> 'Tree':
@@ -119,13 +123,16 @@ class Tree:
         except TrajectoryError as error:
             raise TreeError(str(error)) from None
         _require_goal(arrays['goal'])
+        _require_champions(arrays['champions'], nodes)
         homes = nodes.stance[nodes.planned < 0]
         if np.isnan(arrays['goal'][homes]).any():
             raise TreeError('a root stands on a leg that is no goal')
         if np.isnan(nodes.to_go).any():
             node = int(np.flatnonzero(np.isnan(nodes.to_go))[0])
             raise TreeError(f'node {node} leads round and round, and never home')
-        return cls(nodes, arrays['goal'], header.get('provenance') or {})
+        return cls(
+            nodes, arrays['goal'], header.get('provenance') or {}, arrays['champions']
+        )
 
 
 def _require_kinds(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -134,7 +141,7 @@ def _require_kinds(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) 
         raise TreeError('header lacks model_hash or compensate')
     for name in MEMBERS:
         kind = arrays[name].dtype.kind
-        allowed = 'i' if name in INTEGERS else 'b' if name == 'late' else 'f'
+        allowed = 'i' if name in (*INTEGERS, 'champions') else 'b' if name == 'late' else 'f'
         if kind != allowed or arrays[name].ndim == 0:
             raise TreeError(f'{name} holds {arrays[name].dtype}, expected kind {allowed!r}')
 
@@ -148,3 +155,15 @@ def _require_goal(goal: np.ndarray) -> None:
             raise TreeError('goal must be positive definite on a leg, or NaN')
     if np.isnan(goal).all():
         raise TreeError('goal must be positive definite on one leg at least')
+
+
+def _require_champions(champions: np.ndarray, nodes: Nodes) -> None:
+    """Refuse entries that are none."""
+    if champions.ndim != 2 or len(champions) != len(STANCES):
+        raise TreeError(f'champions has shape {champions.shape}, expected (2, m)')
+    for leg, row in zip(range(len(STANCES)), champions, strict=True):
+        named = row[row >= 0]
+        if (row < -1).any() or (row >= len(nodes)).any():
+            raise TreeError(f'champions must be -1 to {len(nodes) - 1}')
+        if (nodes.stance[named] != leg).any() or not np.isin(named, nodes.entries).all():
+            raise TreeError(f'champions of the {STANCES[leg]} leg must be entries on that leg')

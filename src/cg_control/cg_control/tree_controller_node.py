@@ -4,8 +4,8 @@ The tree is the file that /tree/selected names. A thread loads it, and the robot
 the next state on; a tree of another model, or a file that has changed since, is refused, and the
 one before stays. Until the first one is there, states are not answered; then each is,
 by the command of its stamp, zero torque included, so that the same node works in real time and in
-lock-step. On /diagnostics: mode, node, depth and branch, what look-ups and answers took, ages of
-the measurements and missed deadlines.
+lock-step. On /diagnostics: mode, node, depth and branch, what look-ups, previews and answers
+took, ages of the measurements and missed deadlines.
 
 in    /state, /applied_torque, /tree/selected
 out   /torque_command, /tree/node, /diagnostics
@@ -55,6 +55,10 @@ class TreeControllerSettings(RecoverySettings):
     model_file: str = setting(
         '', 'model of the robot, a file or a name; empty for the nominal compass gait'
     )
+    grown_for: str = setting(
+        '', 'model that the tree was grown for, a file or a name, where more is known by now than '
+        'when it was grown; empty for that of model_file',
+    )  # fmt: skip
     sample_rate_hz: float = setting(
         500.0, 'rate of the states', unit='Hz', minimum=10.0, maximum=2000.0
     )
@@ -88,7 +92,8 @@ class TreeControllerNode(Node):
             path, model, settings, 1.0 / settings.sample_rate_hz, log=self.get_logger().info
         )
         self.controller = TreeController(self.design.controller, settings)
-        self.loader = TreeLoader(model)
+        before = settings.grown_for
+        self.loader = TreeLoader(model, Model.load(model_path(before)) if before else model)
         self.problem = 'no tree selected yet'
         self._selection: TreeSelection | None = None
         self._last_ns: int | None = None
@@ -222,7 +227,11 @@ class TreeControllerNode(Node):
             'slow_answers': self._slow,
         }
         # A copy first: percentiles of thousands take a while.
-        for name, times in (('lookup', controller.lookup_times), ('answer', self._spent)):
+        for name, times in (
+            ('lookup', controller.lookup_times),
+            ('preview', controller.preview_times),
+            ('answer', self._spent),
+        ):
             if times:
                 values |= percentiles(name, 'us', 1e6 * np.array(times), 1)
         values |= self._ages.figures(self.declared.values.deadline)

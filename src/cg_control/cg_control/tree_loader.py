@@ -11,11 +11,12 @@ class TreeLoader:
     """Loads the tree that was selected last, in a thread of its own.
 
     Args:
-        model: The robot: trees of others are refused.
+        model: The robot as it is known.
+        grown_for: Trees of other models are refused.
     """
 
-    def __init__(self, model: Model):
-        self._model = model
+    def __init__(self, model: Model, grown_for: Model):
+        self._model, self._grown_for = model, grown_for
         self._lock = threading.Lock()
         self._asked = 0
         self._found: ReadyTree | ValueError | None = None
@@ -47,7 +48,7 @@ class TreeLoader:
     def _load(self, number: int, selection: TreeSelection) -> None:
         found: ReadyTree | ValueError
         try:
-            found = ReadyTree.of(selection.load(self._model), self._model)
+            found = ReadyTree.of(selection.load(self._grown_for), self._model)
         except ValueError as error:
             found = error
         with self._lock:
