@@ -274,7 +274,7 @@ def main(args: list[str] | None = None) -> int:
         print(f'grow_tree: {error}', file=sys.stderr)
         return 2
     print(
-        f'grow_tree: {options.out}: {len(tree.nodes)} nodes in {int(tree.nodes.branch.max())} '
+        f'grow_tree: {options.out}: {len(tree.nodes)} nodes in {len(np.unique(tree.nodes.branch)) - 1} '
         f'branches, upright on the {" or ".join(tree.legs)} leg'
     )
     return 0

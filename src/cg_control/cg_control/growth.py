@@ -107,7 +107,7 @@ class GrowthOptions:
 
     seed: int = 0
     round_size: int = 512
-    falsifiers: int = 8
+    falsifiers: int = 2
     dense: int = 8192
     at_once: int = 8
     probes: int = 16

@@ -27,7 +27,10 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
 NEAREST, CHAMPIONS = 4, 2 * WIDTH - 4  # two registers full
-LANDING = WalkOptions(sample_time=0.002, step=0.002, minimum_step=0.1)
+# A robot that leans or swings its leg further counts as lost; plans swing it to 1.5 rad.
+LANDING = WalkOptions(
+    sample_time=0.002, step=0.002, minimum_step=0.1, fall_angle=0.6, swing_angle=2.0
+)
 AT_HOME = 3.0  # s that the balance controller may take beyond the end of a motion
 
 

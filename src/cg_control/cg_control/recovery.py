@@ -31,7 +31,7 @@ import numpy as np
 
 from cg_control.balance import BALANCING, IDLE, BalanceController, BalanceSettings, Command
 from cg_control.lookup import Claim, Lookup
-from cg_control.preview import Preview
+from cg_control.preview import LANDING, Preview
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
 from cg_dynamics.model import Model
@@ -48,11 +48,11 @@ class RecoverySettings(BalanceSettings):
     """Parameters of the controller that follows a tree."""
 
     fall_angle: float = setting(
-        0.55, 'lean of the stance leg beyond which nothing is followed', unit='rad',
+        LANDING.fall_angle, 'lean of the stance leg beyond which nothing is followed', unit='rad',
         minimum=0.05, maximum=1.5, live=True,
     )  # fmt: skip
     largest_swing: float = setting(
-        3.0, 'angle of the swing leg beyond which nothing is followed', unit='rad',
+        LANDING.swing_angle, 'angle of the swing leg beyond which nothing is followed', unit='rad',
         minimum=0.1, maximum=3.1, live=True,
     )  # fmt: skip
     remedy: str = setting(
@@ -300,11 +300,13 @@ class TreeController:
             if here > 1.0:  # NaN, where no depth is said, is not
                 return self._previewed(stamp_ns, stance, x, best)
             return STAY
-        if best.depth < here - self.settings.margin and self._nearer(best.node):
+        lost = here > self.settings.hold
+        if lost and best.depth <= 1.0:
             return best.node
-        if here > self.settings.hold:
-            return best.node if best.depth <= 1.0 else NOWHERE
-        return STAY
+        rival = math.isfinite(here) and best.depth < here - self.settings.margin
+        if rival and self._nearer(best.node):
+            return best.node
+        return NOWHERE if lost else STAY
 
     def _previewed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> int:
         assert self._ready is not None

@@ -43,7 +43,7 @@ struct job {
     double *visit_cost, *visit_state;
     /* The law; the simulation. */
     double pull, fastest, limit;
-    double sample_time, step, fall_angle, minimum_step, ahead, slope;
+    double sample_time, step, fall_angle, swing_angle, minimum_step, ahead, slope;
     long p_each, visits, length_at;
 };
 
@@ -330,7 +330,11 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
 
         vi asks = (l.left == 0.0) & l.busy;
         if (any(asks)) {
-            vi arrived = asks & 0, fallen = asks & ~(v_fabs(l.x[st]) < job->fall_angle);
+            vi arrived = asks & 0, upright = v_fabs(l.x[st]) < job->fall_angle;
+#if HYBRID
+            upright &= v_fabs(l.x[1 - st]) < job->swing_angle;
+#endif
+            vi fallen = asks & ~upright;
             if (job->goal) {
                 const double *goal = job->goal + st * FORM;
                 vd away = SPLAT(0.0);

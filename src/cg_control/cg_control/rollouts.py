@@ -45,7 +45,7 @@ FIELDS: dict[Any, tuple[str, ...]] = {
                       'p', 'x', 'elapsed', 'node', 'stance', 'samples', 'clock', 'outcome',
                       'impacts', 'time', 'visited', 'visit_cost', 'visit_state'),
     ctypes.c_double: ('pull', 'fastest', 'limit', 'sample_time', 'step', 'fall_angle',
-                      'minimum_step', 'ahead', 'slope'),
+                      'swing_angle', 'minimum_step', 'ahead', 'slope'),
     ctypes.c_long: ('p_each', 'visits', 'length_at'),
 }  # fmt: skip
 
@@ -54,7 +54,7 @@ class Outcome(enum.IntEnum):
     """How a rollout ended."""
 
     ARRIVED = 1  # in the goal region, on its leg
-    FALLEN = 2  # the stance leg leans too far, or the state ran away
+    FALLEN = 2  # a leg is too far from upright, or the state ran away
     LEFT = 3  # the foot landed where no impact is planned
     TIMED_OUT = 4
 
@@ -215,7 +215,8 @@ class _Work:
         numbers = {
             'pull': law.pulled, 'fastest': law.fastest, 'limit': known.torque_limit,
             'sample_time': how.sample_time, 'step': min(how.step, compiled.largest_step),
-            'fall_angle': how.fall_angle, 'minimum_step': how.minimum_step,
+            'fall_angle': how.fall_angle, 'swing_angle': how.swing_angle,
+            'minimum_step': how.minimum_step,
             'ahead': -1.0 if how.backwards else 1.0, 'slope': how.slope,
             'p_each': int(self.p.ndim == 2), 'visits': self.visited.shape[1],
             'length_at': dict(zip(compiled.parameter_names, range(compiled.np), strict=True)).get(
@@ -241,6 +242,7 @@ class _Work:
 
     def one_by_one(self, robot: Model, known: Model, law, how: WalkOptions) -> None:
         """The same without vector code: the simulation of `walk` and the law of `Tracker`."""
+        self.hybrid = isinstance(robot.mechanism, CompassGait)
         names = compile_model(robot, Setup()).parameter_names
         for b in range(len(self.node)):
             p = self.p[b] if self.p.ndim == 2 else self.p
@@ -278,7 +280,8 @@ class _Work:
         motion = x[: self.nodes.x0.shape[1]]
         if self.goal is not None and motion @ self.goal[leg] @ motion <= 1.0:
             return Outcome.ARRIVED
-        if not abs(x[leg]) < how.fall_angle:
+        swings = self.hybrid and not abs(x[1 - leg]) < how.swing_angle
+        if swings or not abs(x[leg]) < how.fall_angle:
             return Outcome.FALLEN
         if self.nodes.stance[node] != leg and self.nodes.landing[node] < 0:
             return Outcome.LEFT

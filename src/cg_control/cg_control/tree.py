@@ -123,13 +123,13 @@ class Tree:
         except TrajectoryError as error:
             raise TreeError(str(error)) from None
         _require_goal(arrays['goal'])
-        _require_champions(arrays['champions'], nodes)
         homes = nodes.stance[nodes.planned < 0]
         if np.isnan(arrays['goal'][homes]).any():
             raise TreeError('a root stands on a leg that is no goal')
         if np.isnan(nodes.to_go).any():
             node = int(np.flatnonzero(np.isnan(nodes.to_go))[0])
             raise TreeError(f'node {node} leads round and round, and never home')
+        _require_champions(arrays['champions'], nodes)
         return cls(
             nodes, arrays['goal'], header.get('provenance') or {}, arrays['champions']
         )

@@ -14,7 +14,7 @@ from cg_control.growth import Grower, Region
 from cg_control.lookup import Claim, Lookup
 from cg_control.preview import Preview
 from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings, TreeController
-from cg_control.tree import Tree, TreeError
+from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_description.paths import model_path
 from cg_dynamics.c_compiler import compiler
@@ -308,16 +308,17 @@ def test_it_brings_home_what_the_tree_brings_home(make, robot, tree, starts):
     assert (claimed & ~home).sum() <= 3
 
 
+@COMPILED
 def test_a_push_that_balance_alone_does_not_survive_is_answered_by_a_step(make, robot):
     x, push = np.zeros(4), np.array([0.0, 0.0, 0.8, 0.8])  # both legs turn about the foot
     assert not comes_home(make().balance, robot, INNER, x, push)
-    assert comes_home(make(), robot, INNER, x, push)
+    assert comes_home(make(preview=True), robot, INNER, x, push)
 
 
 @pytest.fixture(scope='module')
 def promised(tree, robot):
     """Legs and states that no funnel holds, deep outside, and the entries that bring them home."""
-    leg, x = Region(np.array(BOX)).draw(np.random.default_rng(13), 3000)
+    leg, x = Region(np.array(BOX)).draw(np.random.default_rng(13), 6000)
     _, depth = Lookup(tree.nodes).best_of_many(leg, x)
     outside = np.flatnonzero(depth > 4.0)
     leg, x = leg[outside], x[outside]
@@ -365,7 +366,7 @@ def test_a_way_that_fails_is_left_after_patience(make, promised):
     tell(controller, 0, leg, x)
     x = np.roll(np.array([-0.45, -0.3, -1.4, 0.0]).reshape(2, 2), leg, axis=1).ravel()
     modes = [tell(controller, tick, leg, x).mode for tick in range(5, 30)]
-    assert modes.count(FOLLOWING) == pytest.approx(15, abs=2)
+    assert modes.count(FOLLOWING) == 10  # until 30 ms after the start
     assert modes[-1] == OUTSIDE
 
 

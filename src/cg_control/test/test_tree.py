@@ -18,12 +18,12 @@ def grown(robot, step, back) -> Tree:
     forth = Nodes.of(step, robot)
     nodes = forth.grafted(back, robot, forth.first)
     goal = np.array([np.full((4, 4), np.nan), 25.0 * np.eye(4)])
-    return Tree(nodes, goal, {'seed': 3})
+    return Tree(nodes, goal, {'seed': 3}, np.array([[forth.first, -1], [nodes.first, 0]]))
 
 
 def rewritten(grown, path, **changes):
     """The file of a tree with other arrays."""
-    arrays = {name: getattr(grown.nodes, name) for name in ARRAYS} | {'goal': grown.goal}
+    arrays = grown.arrays()
     grown.save(path)
     with zipfile.ZipFile(path) as archive:
         header = archive.read('header.npy')
@@ -41,6 +41,7 @@ def test_a_tree_comes_back_to_the_bit(grown, robot, tmp_path):
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back.nodes, name), getattr(grown.nodes, name))
     np.testing.assert_array_equal(back.goal, grown.goal)
+    np.testing.assert_array_equal(back.champions, grown.champions)
     assert back.provenance == {'seed': 3}
     assert back.legs == ('outer',)
 
@@ -70,11 +71,15 @@ def test_a_tree_of_another_model_is_refused(grown, tmp_path):
         ('goal', lambda a: -a, 'goal must be positive definite'),
         ('goal', lambda a: a[:1], 'goal has shape'),
         ('u0', lambda a: np.array(1.0), 'u0 holds'),
+        ('champions', lambda a: a * 1.0, 'champions holds'),
+        ('champions', lambda a: a[:1], 'champions has shape'),
+        ('champions', lambda a: a + 100000, 'champions must be -1 to'),
+        ('champions', lambda a: a[::-1], 'champions of the inner leg must be entries'),
+        ('champions', lambda a: np.where(a >= 0, a + 1, a), 'leg must be entries on that leg'),
     ],
 )
 def test_what_is_no_tree_is_named(grown, tmp_path, name, change, said):
-    value = grown.goal if name == 'goal' else getattr(grown.nodes, name)
-    path = rewritten(grown, tmp_path / 'tree.npz', **{name: change(value)})
+    path = rewritten(grown, tmp_path / 'tree.npz', **{name: change(grown.arrays()[name])})
     with pytest.raises(TreeError, match=said):
         Tree.load(path)
 

@@ -53,6 +53,7 @@ class WalkOptions:
             the ground, the real one scuffs. Infinite: feet pass through the ground.
         stop_on_scuff: End at the first scuff.
         fall_angle: Lean of the stance leg in rad that counts as a fall.
+        swing_angle: Angle of the swing leg in rad that counts as one, too.
         largest_steps: End after so many impacts.
     """
 
@@ -64,10 +65,11 @@ class WalkOptions:
     clearance: float = math.inf
     stop_on_scuff: bool = False
     fall_angle: float = 1.0
+    swing_angle: float = math.inf
     largest_steps: int = 1000
 
     def __post_init__(self):
-        for name in ('step', 'sample_time', 'clearance', 'fall_angle'):
+        for name in ('step', 'sample_time', 'clearance', 'fall_angle', 'swing_angle'):
             if not getattr(self, name) > 0:
                 raise ValueError(f'{name} must be positive, got {getattr(self, name)}')
         if not abs(self.slope) < math.pi / 2:
@@ -478,7 +480,10 @@ class Walker:
             yield 'impact', height
             if math.isfinite(self.options.clearance):
                 yield 'scuff', lambda x: height(x) + self.options.clearance
-        yield 'fall', lambda x: self.options.fall_angle - abs(x[standing])
+        if self.command is not None:  # `move` goes on, so a fall would be found again and again
+            yield 'fall', lambda x: self.options.fall_angle - abs(x[standing])
+            if math.isfinite(self.options.swing_angle):
+                yield 'fall', lambda x: self.options.swing_angle - abs(x[1 - standing])
         if leg.mode == 'stick' and math.isfinite(self.law.friction):
             yield 'slip', lambda x: self._cone(leg, x, u)
         elif leg.mode == 'slide':
