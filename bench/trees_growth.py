@@ -1,6 +1,6 @@
 """A tree to both legs: how it grows, what it covers, how often its claims are false.
 
-    python bench/trees_growth.py [--samples 20000] [--workers 2] [--write]
+    python bench/trees_growth.py [--samples 20000] [--workers 2] [--write] [--tree FILE]
 
 States are drawn as in bench/trees_screen.py, whose census of many guesses is what the tree is held
 against (results/tree_census.jsonl: 640 states of the seeds 46 and 47, which neither this bench nor
@@ -29,7 +29,7 @@ import numpy as np
 from scipy.stats import beta
 
 from cg_control.extension import Extension
-from cg_control.grow_tree import BOX, CHAMPIONSHIP, GROWTH, SAMPLE, upright_tree
+from cg_control.grow_tree import BOX, CHAMPIONSHIP, GROWTH, REGION, SAMPLE, upright_tree
 from cg_control.growth import Grower, Region
 from cg_control.lookup import Lookup
 from cg_control.preview import CHAMPIONS, LANDING, Preview, champions, pruned
@@ -105,18 +105,18 @@ def judged(tree: Tree, policy: Policy) -> tuple[Share, Share]:
     return Share(int(home.sum()), len(home)), Share(int(false.sum()), int(claimed.sum()))
 
 
-def with_champions(tree: Tree, count: int) -> tuple[Tree, np.ndarray]:
-    """The tree with champions, and so many of them of each leg, in order."""
-    sample = Region(HALF).draw(np.random.default_rng([0, CHAMPIONSHIP]), SAMPLE)
-    order = champions(Preview(tree, MODEL, threads=THREADS), *sample, count=count)
-    return replace(tree, champions=order[:, :CHAMPIONS]), order
+def with_champions(tree: Tree, count: int) -> Tree:
+    """The tree with so many champions of each leg."""
+    sample = REGION.draw(np.random.default_rng([0, CHAMPIONSHIP]), SAMPLE)
+    found = champions(Preview(tree, MODEL, threads=THREADS), *sample, count=count)
+    return replace(tree, champions=found)
 
 
 def grow(samples: int, workers: int) -> tuple[Tree, list[str], str]:
     """A tree, the rows of its growth curve and a sentence about its cost."""
     processes = WatchedProcesses(workers)
     grower = Grower(
-        MODEL, upright_tree(MODEL), Region(HALF), Extension(MODEL, executor=processes), GROWTH,
+        MODEL, upright_tree(MODEL), REGION, Extension(MODEL, executor=processes), GROWTH,
         threads=workers,
     )  # fmt: skip
     rows: list[str] = []
@@ -129,7 +129,7 @@ def grow(samples: int, workers: int) -> tuple[Tree, list[str], str]:
         counts = grower.counts
         if counts.samples >= marks[min(len(rows), len(marks) - 1)]:
             covered, false = judged(grower.tree, by_funnels)
-            previewed, _ = judged(with_champions(grower.tree, CHAMPIONS)[0], by_previews)
+            previewed, _ = judged(with_champions(grower.tree, CHAMPIONS), by_previews)
             rows.append(
                 f'| {counts.samples} | {counts.grown} | {len(grower.nodes)} | {wall:.0f} '
                 f'| {covered} | {false} | {previewed} |'
@@ -149,10 +149,11 @@ def grow(samples: int, workers: int) -> tuple[Tree, list[str], str]:
 
 def pruned_rows(tree: Tree) -> list[str]:
     """What is left of the tree with so many branches of each leg."""
-    whole, order = with_champions(tree, max(KEPT))
+    whole = with_champions(tree, max(KEPT))
     rows = []
     for count in (*KEPT, 0):
-        one = pruned(whole, order[:, :count]) if count else whole
+        named = replace(whole, champions=whole.champions[:, : count or CHAMPIONS])
+        one = pruned(named) if count else named
         covered, false = judged(one, by_previews)
         own, wrong = judged(one, by_funnels)
         rows.append(
@@ -168,8 +169,11 @@ def main() -> None:
     parser.add_argument('--samples', type=int, default=20000, help='[20000]')
     parser.add_argument('--workers', type=int, default=THREADS)
     parser.add_argument('--write', action='store_true', help='store the tables')
+    parser.add_argument('--tree', type=Path, help='store the whole tree in this file')
     options = parser.parse_args()
     tree, rows, words = grow(options.samples, options.workers)
+    if options.tree:
+        with_champions(tree, CHAMPIONS).save(options.tree)
     text = '\n'.join([
         '# A tree to both legs',
         '',

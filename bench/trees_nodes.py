@@ -4,9 +4,10 @@
     ./cg run cg_control grow_tree --samples 4096 --out tree.npz             one of 10 000 nodes
 
 Six processes: machine, observer, tree server, tree controller, gate, and a listener that collects
-what the controller says on /diagnostics. The robot begins at a state that the tree claims, comes
-home, and balances; every state is looked up, at home as well. *Look-up* is the time of one product
-and its least entry in the controller's process, *answer* that from a state's arrival to its torque
+what the controller says on /diagnostics. The robot begins at a state that the tree brings home,
+comes home, and balances; every state is looked up, at home as well. *Look-up* is the time of one product
+and its least entry in the controller's process, *preview* that of simulating where the tree leads
+from a state that no funnel holds, *answer* that from a state's arrival to its torque
 on the topic. A *slow* answer took longer than a sample, 2 ms. *Age* is that of the measurement
 when the drive latched the torque that answers it, *late* if more than 4 ms.
 """
@@ -81,7 +82,7 @@ def main() -> None:
             )
             figures = [
                 ' / '.join(last.get(f'{name}_{k}_{unit}', '-') for k in ('p50', 'p99', 'max'))
-                for name, unit in (('lookup', 'us'), ('answer', 'us'), ('age', 'ms'))
+                for name, unit in (('lookup', 'us'), ('preview', 'us'), ('answer', 'us'), ('age', 'ms'))
             ]
             rows.append(
                 f'| {mode} | {load:.1f} | {" | ".join(figures)} | {counted["slow_answers"]} '
@@ -97,9 +98,9 @@ def main() -> None:
         'as stated. What is counted is said at the top of the script. '
         f'Tree: {len(Tree.load(path).nodes)} nodes.',
         '',
-        '| clock | load | look-up, us (p50 / p99 / max) | answer, us | age, ms | slow | late '
+        '| clock | load | look-up, us (p50 / p99 / max) | preview, us | answer, us | age, ms | slow | late '
         '| at the end |',
-        '|---|---:|---|---|---|---:|---:|---|',
+        '|---|---:|---|---|---|---|---:|---:|---|',
         *rows,
         '',
     ])  # fmt: skip

@@ -1,9 +1,10 @@
 """Recovery along a tree live: `ros2 run cg_bringup recover_balance --seed 3 --mode lockstep`.
 
-The robot begins somewhere in the funnels of a tree, away from upright, or upright and is pushed;
-it comes home as the tree says, and balances there. Starts the simulated hardware off its blocks,
-the observer, the tree server, the tree controller and the safety gate as processes of their own,
-for machines without `ros2 launch`; tree.launch.py starts the same nodes with the same parameters.
+The robot begins away from upright, somewhere from where the tree brings it home, or upright and is
+pushed; it comes home as the tree says, and balances there. Starts the simulated hardware off its
+blocks, the observer, the tree server, the tree controller and the safety gate as processes of
+their own, for machines without `ros2 launch`; tree.launch.py starts the same nodes with the same
+parameters.
 The last line says whether the robot stands in the end, and so does the exit status.
 """
 
@@ -22,15 +23,15 @@ from cg_bringup.runs import CLOSING, MODES, NOMINAL_MODEL, NodeOf
 from cg_bringup.verdict import recovery_verdict
 from cg_control.grow_tree import BOX
 from cg_control.growth import Region
-from cg_control.lookup import Lookup
+from cg_control.preview import Preview
 from cg_control.tree import Tree, TreeError
 from cg_control.tree_files import tree_path
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
-STARTS = ('funnel', 'upright')
-DRAWS = 10_000  # states tried for one that the tree claims
+STARTS = ('tree', 'upright')
+DRAWS, AT_ONCE = 300, 32  # states tried for one that comes home
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class RecoverOptions:
         model: Model file of observer, tree and controller.
         grown_for: Model file that the tree was grown for, where `model` knows more by now.
         tree: Name or file.
-        start: 'funnel': a state that the tree claims, drawn by the seed; 'upright'.
+        start: 'tree': a state from which the tree brings the robot home, drawn by the seed;
+            'upright'.
         stance: Leg that stands at an upright start.
         mode: Clock of the machine.
         seed: Of the start and of the sensor noise.
@@ -56,7 +58,7 @@ class RecoverOptions:
     model: str = ''
     grown_for: str = ''
     tree: str = 'compass_gait_mit'
-    start: str = 'funnel'
+    start: str = 'tree'
     stance: str = 'inner'
     mode: str = 'real_time'
     seed: int = 1
@@ -66,23 +68,28 @@ class RecoverOptions:
     bag: str = ''
 
 
-def claimed_state(tree: Tree, seed: int) -> tuple[str, np.ndarray]:
-    """A state in a funnel and in no goal region: the leg that stands, and x (4,).
+def start_of(tree: Tree, model: Model, seed: int) -> tuple[str, np.ndarray]:
+    """A state outside the goal regions from which a tree brings a robot home.
 
     Args:
         tree: Of a compass gait.
+        model: The robot: previews say what comes home.
         seed: Says which.
 
+    Returns:
+        The leg that stands, and x (4,).
+
     Raises:
-        TreeError: The tree claims hardly anything.
+        TreeError: The tree brings hardly anything home.
     """
-    leg, x = Region(np.array(BOX)).draw(np.random.default_rng(seed), DRAWS)
-    _, depth = Lookup(tree.nodes).best_of_many(leg, x)
-    away = ~(np.einsum('bi,bij,bj->b', x, tree.goal[leg], x) <= 1.0)
-    claimed = np.flatnonzero((depth <= 1.0) & away)
-    if not len(claimed):
-        raise TreeError(f'the tree claims none of {DRAWS} states outside its goals')
-    return STANCES[leg[claimed[0]]], x[claimed[0]]
+    preview, rng = Preview(tree, model), np.random.default_rng(seed)
+    for _ in range(DRAWS):
+        leg, x = Region(np.array(BOX)).draw(rng, AT_ONCE)
+        away = ~(np.einsum('bi,bij,bj->b', x, tree.goal[leg], x) <= 1.0)
+        found = np.flatnonzero(away & (preview.choose(leg, x) >= 0))
+        if len(found):
+            return STANCES[leg[found[0]]], x[found[0]]
+    raise TreeError(f'the tree brings home none of {DRAWS * AT_ONCE} states outside its goals')
 
 
 def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
@@ -95,9 +102,10 @@ def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
     path = tree_path(options.tree)
     grown_for = options.grown_for or options.model
     stance, x = options.stance, np.zeros(4)
-    if options.start == 'funnel':
-        model = Model.load(model_path(grown_for or NOMINAL_MODEL))
-        stance, x = claimed_state(Tree.load(path, model), options.seed)
+    if options.start == 'tree':
+        tree = Tree.load(path, Model.load(model_path(grown_for or NOMINAL_MODEL)))
+        known = Model.load(model_path(options.model or NOMINAL_MODEL))
+        stance, x = start_of(tree, known, options.seed)
     machine: dict[str, Any] = {
         'model_file': options.robot,
         'setup': yaml.safe_dump({'stance': stance, 'on_blocks': False}),
@@ -152,7 +160,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument(
         '--tree', default=default.tree, help=f'a file or a name [{default.tree}]'
     )
-    parser.add_argument('--start', choices=STARTS, default='funnel', help='[funnel]')
+    parser.add_argument('--start', choices=STARTS, default='tree', help='[tree]')
     parser.add_argument('--stance', choices=STANCES, default='inner', help='upright: [inner]')
     parser.add_argument('--mode', choices=MODES, default='real_time', help='[real_time]')
     parser.add_argument('--seed', type=int, default=1, help='of start and sensor noise [1]')

@@ -13,10 +13,11 @@ from rclpy.parameter import Parameter  # noqa: E402
 
 from cg_bringup import recover_run  # noqa: E402
 from cg_bringup.balancing import balance  # noqa: E402
-from cg_bringup.recover_run import RecoverOptions, claimed_state, recover_nodes  # noqa: E402
+from cg_bringup.recover_run import RecoverOptions, recover_nodes, start_of  # noqa: E402
 from cg_control.balance import BalanceController, balance_gains  # noqa: E402
 from cg_control.basin import shipped_basins  # noqa: E402
 from cg_control.lookup import Lookup  # noqa: E402
+from cg_control.preview import Preview  # noqa: E402
 from cg_control.recovery import ReadyTree, RecoverySettings, TreeController  # noqa: E402
 from cg_control.tree import Tree, TreeError  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
@@ -49,7 +50,7 @@ def tree():
 def seed_of_a_step(tree):
     """A seed whose start is well inside the funnel of a node that is one step away from home."""
     for seed in range(200):
-        stance, x = claimed_state(tree, seed)
+        stance, x = start_of(tree, MODEL, seed)
         claim = Lookup(tree.nodes).best(STANCES.index(stance), x)
         if claim.depth < 0.3 and tree.nodes.steps[claim.node] == 1:
             return seed
@@ -106,7 +107,7 @@ def test_robot_comes_home_along_the_tree_and_balances(tree):
 def test_nodes_are_told_one_robot_one_tree_and_one_start(tree):
     nodes = recover_nodes(RecoverOptions(seed=5, pushes=(1.0, 2.0), bag='here'))
     machine = nodes['simulation_node'].parameters
-    stance, x = claimed_state(tree, 5)
+    stance, x = start_of(tree, MODEL, 5)
     setup = yaml.safe_load(machine['setup'])
     assert setup == {'stance': stance, 'on_blocks': False}
     assert machine['initial_state'] == x.tolist()
@@ -119,15 +120,26 @@ def test_nodes_are_told_one_robot_one_tree_and_one_start(tree):
         assert upright[name].parameters['model_file'] == 'mine.yaml'
 
 
-def test_a_start_is_claimed_and_not_at_home(tree):
+def test_a_start_comes_home_and_is_not_there(tree):
+    preview, outside = Preview(tree, MODEL), 0
     for seed in range(20):
-        stance, x = claimed_state(tree, seed)
+        stance, x = start_of(tree, MODEL, seed)
         leg = STANCES.index(stance)
-        assert Lookup(tree.nodes).best(leg, x).depth <= 1.0
+        assert preview.choose(np.array([leg]), x[None])[0] >= 0
         assert x @ tree.goal[leg] @ x > 1.0
-    tree = Tree(tree.nodes, 1e-9 * tree.goal)
-    with pytest.raises(TreeError, match='claims none of'):
-        claimed_state(tree, 1)
+        outside += Lookup(tree.nodes).best(leg, x).depth > 1.0
+    assert outside > 2  # no funnel holds these
+    with pytest.raises(TreeError, match='brings home none of'):
+        start_of(Tree(tree.nodes, 1e9 * tree.goal), MODEL, 1)
+
+
+def test_a_tree_may_be_of_the_robot_as_it_was_known_before(tree):
+    options = RecoverOptions(model='compass_gait_flexible', grown_for='compass_gait_mit')
+    nodes = recover_nodes(options)
+    assert nodes['tree_server'].parameters['model_file'] == 'compass_gait_mit'
+    assert nodes['tree_controller'].parameters['grown_for'] == 'compass_gait_mit'
+    for name in ('tree_controller', 'observer'):
+        assert nodes[name].parameters['model_file'] == 'compass_gait_flexible'
 
 
 def test_pushes_are_answered_by_steps_with_an_observer(tree):

@@ -39,6 +39,7 @@ from cg_dynamics.watched_processes import LIMIT, WatchedProcesses
 
 GOALS = {'either': STANCES, 'inner': ('inner',), 'outer': ('outer',)}
 BOX = (0.5, 0.8, 1.5, 4.0)  # rad, rad, rad/s, rad/s: Region
+REGION = Region(np.array(BOX), near=0.5)
 SWING = 0.3  # rad: amplitude of the swing leg up to which a robot counts as home
 GROWTH = GrowthOptions(at_once=16)
 EVERY = 8.0  # s between lines of progress
@@ -167,7 +168,7 @@ def grow(
     extension = Extension(model, legs, executor=executor)
     grower = Grower(
         model, upright_tree(model, legs) if saved is None else saved.tree,
-        Region(np.array(BOX)), extension, replace(GROWTH, seed=seed), simulation=LANDING,
+        REGION, extension, replace(GROWTH, seed=seed), simulation=LANDING,
         threads=threads,
     )  # fmt: skip
     more = {'goal': goal, 'extension': extension.options}
@@ -186,9 +187,11 @@ def grow(
     tree = grower.tree
     sample = grower.region.draw(np.random.default_rng([seed, CHAMPIONSHIP]), SAMPLE)
     order = champions(
-        Preview(tree, model, threads=threads), *sample, count=max(branches, CHAMPIONS)
+        Preview(tree, model, threads=threads), *sample, count=branches or CHAMPIONS
     )
-    tree = pruned(tree, order) if branches else replace(tree, champions=order[:, :CHAMPIONS])
+    tree = replace(tree, champions=order)
+    if branches:
+        tree = pruned(tree)
     told = {
         'command': f'grow_tree --goal {goal} --samples {samples} --seed {seed}'
         f' --branches {branches}',

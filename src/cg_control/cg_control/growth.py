@@ -47,15 +47,21 @@ class Region:
         half: Half its edges: lean of the stance leg, angle of the swing leg to it, and their
             rates, in rad and rad/s, shape (4,); of another mechanism its coordinates, (nx,).
         legs: How many legs can stand.
+        near: Share of the states that is drawn from a box shrunk about upright, by a factor drawn
+            with each: where pushes lead is a small part of the box.
     """
 
     half: np.ndarray
     legs: int = 2
+    near: float = 0.0
 
     def draw(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Stance legs (count,) and states (count, nx), in the order of the coordinates."""
         leg = rng.integers(0, self.legs, count)
         roles = rng.uniform(-1.0, 1.0, (count, len(self.half))) * self.half
+        if self.near:
+            shrunk = rng.random(count) < self.near
+            roles[shrunk] *= rng.random((int(shrunk.sum()), 1))
         return leg, in_coordinates(leg, roles) if len(self.half) == 4 else roles
 
 

@@ -258,6 +258,7 @@ class Walker:
         self.step = min(options.step, *(c.largest_step for c in self.compiled.values()))
         self.delay = self.compiled['inner'].delays(self.p)[0]
         self._root = scipy.optimize.brentq  # loaded now: no landing must wait for it
+        self.falls = False  # end the walk; `move` goes on, and would find them again and again
         self.events: list[Event] = []
         self.scuffed = False
         self.free: dict[str, FreeFoot] = {}
@@ -272,7 +273,7 @@ class Walker:
         torques: Sequence[tuple[float, float]] = (),
     ) -> Walk:
         """A whole walk: see `walk`."""
-        compiled = self.compiled[stance]
+        compiled, self.falls = self.compiled[stance], True
         # Torques on their way: (instant at which it acts, torque).
         latches = [(instant, self.inputs(torque)) for instant, torque in torques]
         u = self.inputs(0.0)
@@ -480,7 +481,7 @@ class Walker:
             yield 'impact', height
             if math.isfinite(self.options.clearance):
                 yield 'scuff', lambda x: height(x) + self.options.clearance
-        if self.command is not None:  # `move` goes on, so a fall would be found again and again
+        if self.falls:
             yield 'fall', lambda x: self.options.fall_angle - abs(x[standing])
             if math.isfinite(self.options.swing_angle):
                 yield 'fall', lambda x: self.options.swing_angle - abs(x[1 - standing])
