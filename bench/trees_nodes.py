@@ -5,10 +5,10 @@
 
 Six processes: machine, observer, tree server, tree controller, gate, and a listener that collects
 what the controller says on /diagnostics. The robot begins at a state that the tree brings home,
-comes home, and balances; every state is looked up, at home as well. *Look-up* is the time of one product
-and its least entry in the controller's process, *preview* that of simulating where the tree leads
-from a state that no funnel holds, *answer* that from a state's arrival to its torque
-on the topic. A *slow* answer took longer than a sample, 2 ms. *Age* is that of the measurement
+comes home, and balances; every state is looked up, at home as well. *Look-up* is the time of one
+product and its least entry in the controller's process, *preview* that of simulating where the
+tree leads from a state that no funnel holds, *answer* that from a state's arrival to its torque on
+the topic. A *slow* answer took longer than a sample, 2 ms. *Age* is that of the measurement
 when the drive latched the torque that answers it, *late* if more than 4 ms.
 """
 
@@ -35,6 +35,7 @@ from cg_description.model_file import write_atomically
 from cg_dynamics.domains import own_domain
 
 RESULT = Path(__file__).parent / 'results' / 'trees_nodes.md'
+FIGURES = (('lookup', 'us'), ('preview', 'us'), ('answer', 'us'), ('age', 'ms'))
 COUNTED = ('slow_answers', 'missed_deadlines')
 
 
@@ -82,7 +83,7 @@ def main() -> None:
             )
             figures = [
                 ' / '.join(last.get(f'{name}_{k}_{unit}', '-') for k in ('p50', 'p99', 'max'))
-                for name, unit in (('lookup', 'us'), ('preview', 'us'), ('answer', 'us'), ('age', 'ms'))
+                for name, unit in FIGURES
             ]
             rows.append(
                 f'| {mode} | {load:.1f} | {" | ".join(figures)} | {counted["slow_answers"]} '
@@ -98,8 +99,8 @@ def main() -> None:
         'as stated. What is counted is said at the top of the script. '
         f'Tree: {len(Tree.load(path).nodes)} nodes.',
         '',
-        '| clock | load | look-up, us (p50 / p99 / max) | preview, us | answer, us | age, ms | slow | late '
-        '| at the end |',
+        '| clock | load | look-up, us (p50 / p99 / max) | preview, us | answer, us | age, ms '
+        '| slow | late | at the end |',
         '|---|---:|---|---|---|---|---:|---:|---|',
         *rows,
         '',

@@ -1,4 +1,4 @@
-"""Does a tree make a better robot? Pushes and starts, and a robot that is not the one that is known.
+"""Does a tree make a better robot? Pushes and starts, and a robot that is not as it is known.
 
     python bench/trees_robust.py [--robots 40] [--workers 2] [--write]
 
@@ -34,7 +34,13 @@ from trees_live import EPSILONS, Known, share
 
 from cg_bringup.balancing import balance
 from cg_bringup.recover_run import RecoverOptions, start_of
-from cg_control.balance import BALANCING, BalanceController, BalanceSettings, Command, balance_gains
+from cg_control.balance import (
+    BALANCING,
+    BalanceController,
+    BalanceSettings,
+    Command,
+    balance_gains,
+)
 from cg_control.basin import sample_basin, shipped_basins
 from cg_control.collocation import Options
 from cg_control.execution import ExecutionSettings, TrajectoryController

@@ -24,7 +24,7 @@ ARGUMENTS = {
     'model': ('', 'model of observer, tree and controller; empty: nominal', None),
     'grown_for': ('', 'model of the tree, where model knows more; empty: the same', None),
     'tree': (DEFAULT.tree, 'tree that is followed: a file or a name', None),
-    'start': (DEFAULT.start, 'tree: a state from which it brings the robot home; upright', list(STARTS)),
+    'start': (DEFAULT.start, 'tree: from where it brings the robot home; upright', list(STARTS)),
     'stance': ('inner', 'leg that stands at an upright start', list(STANCES)),
     'mode': ('real_time', 'clock of the machine', list(MODES)),
     'seed': ('1', 'seed of the start and of the sensor noise', None),

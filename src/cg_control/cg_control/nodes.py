@@ -285,11 +285,10 @@ class Nodes:
             keep = more
         place = np.where(keep, np.cumsum(keep) - 1, -1)
         rows = self._rows(np.flatnonzero(keep))
-        moved = {
-            name: np.where(old < 0, -1, place[old]).astype(np.int32)
-            for name, old in (('next', rows.next), ('landing', rows.landing))
-        }
-        return replace(rows, **moved), place
+        then, landing = (
+            np.where(old < 0, -1, place[old]).astype(np.int32) for old in (rows.next, rows.landing)
+        )
+        return replace(rows, next=then, landing=landing), place
 
     @functools.cached_property
     def entries(self) -> np.ndarray:

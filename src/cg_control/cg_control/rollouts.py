@@ -345,7 +345,7 @@ def rollout_library(robot: Model, compensated: Model | None) -> ctypes.CDLL | No
     """
     if compiler() is None:
         return None
-    key = robot.hash, compensated and compensated.hash
+    key = robot.hash, None if compensated is None else compensated.hash
     if key not in _libraries:
         _libraries[key] = _built(robot, compensated)
     return _libraries[key]

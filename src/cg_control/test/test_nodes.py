@@ -169,3 +169,19 @@ def test_arrays_that_are_no_tree_are_refused(tree, name, node, value, message):
         replace(tree, **{name: array}).require_consistency()
     with pytest.raises(TrajectoryError, match='has shape'):
         replace(tree, **{name: array[:-1]}).require_consistency()
+
+
+def test_a_pruned_tree_keeps_what_a_branch_ends_on(robot, step, back):
+    forth = Nodes.of(step, robot)
+    there = forth.grafted(back, robot, forth.first)  # ends on the first one
+    both = there.grafted(step, robot, 0)
+    whole, place = both.pruned(np.array([2]))
+    assert sorted(np.unique(whole.branch)) == [0, 1, 2]
+    whole.require_consistency()
+    kept = np.flatnonzero(place >= 0)
+    np.testing.assert_array_equal(whole.x0, both.x0[kept])
+    np.testing.assert_array_equal(whole.to_go, both.to_go[kept])
+    np.testing.assert_array_equal(whole.landing >= 0, both.landing[kept] >= 0)
+    alone, _ = both.pruned(np.array([3]))
+    assert sorted(np.unique(alone.branch)) == [0, 3]
+    np.testing.assert_array_equal(alone.to_go[1:], both.to_go[both.branch == 3])

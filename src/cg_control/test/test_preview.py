@@ -21,7 +21,7 @@ FINE = WalkOptions(sample_time=0.002, step=0.0005, minimum_step=0.1)
 @pytest.fixture(scope='module')
 def tree(robot):
     options = GrowthOptions(seed=4, round_size=64, at_once=8)
-    grower = Grower(robot, upright_tree(robot), REGION, Extension(robot), options, simulation=LANDING)
+    grower = Grower(robot, upright_tree(robot), REGION, Extension(robot), options)
     for _ in range(2):
         grower.round()
     return grower.tree
@@ -57,7 +57,7 @@ def test_more_come_home_than_funnels_hold(robot, tree, states):
     held = depth <= 1.0
     held[held] = arrives(tree, robot, node[held], x[held])
     previewed = Preview(tree, robot).choose(leg, x) >= 0
-    assert previewed.mean() > 1.3 * held.mean()
+    assert previewed.mean() > 1.15 * held.mean()
     assert previewed[held].mean() > 0.95
 
 

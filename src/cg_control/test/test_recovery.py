@@ -16,11 +16,9 @@ from cg_control.preview import Preview
 from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings, TreeController
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_description.paths import model_path
 from cg_dynamics.c_compiler import compiler
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.hybrid import Walker
-from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
 COMPILED = pytest.mark.skipif(compiler() is None, reason='hundreds of rollouts')
