@@ -197,6 +197,18 @@ def test_falls_and_runaways_leave_the_others_alone(robot, tree):
     np.testing.assert_array_equal(found.state[others], calm.state[others])
 
 
+@pytest.mark.parametrize('vector', [True, False])
+def test_a_leg_that_swings_too_far_is_a_fall(robot, tree, vector, monkeypatch):
+    if not vector:
+        monkeypatch.setattr(module, 'compiler', lambda: None)
+    start = np.full(6, tree.landing[tree.first])
+    x = drawn(tree, start, seed=9, share=0.2)
+    x[2, :2], x[4, :2] = [0.0, 0.9], [0.0, -0.9]  # the outer leg swings
+    narrow = WalkOptions(sample_time=0.002, step=0.002, swing_angle=0.8)
+    found = follow(tree, robot, start, x, 0.05, options=narrow)
+    assert (found.outcome == Outcome.FALLEN).tolist() == [k in (2, 4) for k in range(6)]
+
+
 @pytest.mark.parametrize('threads', [1, 2, 3])
 def test_results_do_not_depend_on_company(robot, tree, threads):
     """Bit by bit: growing a tree must not depend on how its work is shared."""

@@ -169,6 +169,23 @@ def test_robot_that_leans_too_far_has_fallen(robot):
     assert abs(done.state[0]) == pytest.approx(1.0, abs=1e-9)
 
 
+def test_a_leg_that_swings_too_far_ends_the_walk(robot):
+    x0, kick = np.array([0.0, 0.0, 0.0, 8.0]), WalkOptions(swing_angle=1.2)
+    done = walk(robot, 'inner', x0, 5.0, None, kick)
+    assert done.outcome == 'fall'
+    assert abs(done.state[1]) == pytest.approx(1.2, abs=1e-9)
+    assert abs(done.state[0]) < 1.0
+
+
+def test_a_robot_that_falls_is_moved_on(robot):
+    """A walk ends at a fall; `move` goes on, whatever the robot does."""
+    walker = Walker(robot, WalkOptions(fall_angle=0.5, swing_angle=0.5), None)
+    leg, x = walker.stand('inner'), np.array([-0.2, 0.0, -1.0, 0.0])
+    for _ in range(300):
+        leg, x = walker.move(leg, x, walker.inputs(0.0), 0.002)
+    assert x[0] < -0.8
+
+
 def test_command_is_sampled_held_and_late(bare):
     asked = []
 
