@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta
 
-from cg_bringup.balancing import balance
+from cg_bringup.balancing import BalanceRun, balance
 from cg_bringup.recover_run import RecoverOptions, start_of
 from cg_control.balance import BalanceController, BalanceSettings, balance_gains
 from cg_control.basin import shipped_basins
@@ -64,11 +64,11 @@ class Fared:
     outside: int
 
 
-def recovered(
+def in_the_loop(
     ready: ReadyTree | None, stance: str, x, epsilon: float | None, seed: int, pushes=(),
-    settings: RecoverySettings | None = None,
-) -> Fared:
-    """One run of the loop.
+    settings: RecoverySettings | None = None, duration: float = DURATION,
+) -> tuple[BalanceRun, BalanceController | TreeController]:
+    """One run of the loop, and the controller that was in it.
 
     Args:
         ready: The tree; None: the balance controller alone.
@@ -78,17 +78,26 @@ def recovered(
         seed: Of the noise.
         pushes: Instants in s and impulses in N s.
         settings: Of the tree controller.
+        duration: In s.
     """
     setup = Setup(stance=stance, on_blocks=False)
     plant = Plant(MODEL, setup, np.asarray(x, float), seed=seed, minimum_step=LANDING.minimum_step)
     observer = Known(plant) if epsilon is None else HighGainObserver(MODEL, setup, epsilon)
     settings = settings or RecoverySettings()
     balancing = BalanceController(MODEL, settings, GAINS, BASINS)
-    controller = balancing
+    controller: BalanceController | TreeController = balancing
     if ready is not None:
         controller = TreeController(balancing, settings)
         controller.take(ready)
-    run = balance(plant, observer, controller, DURATION, pushes)
+    return balance(plant, observer, controller, duration, pushes), controller
+
+
+def recovered(
+    ready: ReadyTree | None, stance: str, x, epsilon: float | None, seed: int, pushes=(),
+    settings: RecoverySettings | None = None,
+) -> Fared:
+    """How one run of the loop ends; arguments as `in_the_loop`."""
+    run, controller = in_the_loop(ready, stance, x, epsilon, seed, pushes, settings)
     switches = getattr(controller, 'switches', 0)
     return Fared(run.upright(DURATION), switches, int((run.torque == 0.0).sum()))
 
