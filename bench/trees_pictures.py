@@ -84,7 +84,7 @@ def slices() -> list[Slice]:
         ))  # fmt: skip
     for leg, stance in enumerate(STANCES):
         found.append(Slice(
-            leg, f'{stance} leg stands, leaning {LEAN:g} rad, at rest',
+            leg, f'{stance} leg stands still, leaning {LEAN:g} rad',
             ('swing leg to stance leg, rad (ahead: negative)', 'its rate, rad/s'),
             (swing, swing_rate), lambda a, b: [LEAN + 0 * a, a, 0 * a, b],
         ))  # fmt: skip
@@ -134,12 +134,13 @@ def draw_slices(target: Path) -> None:
         axes.set(xlabel=one.axes[0], ylabel=one.axes[1])
         print(
             f'{one.title}: {share:.0%} home, the slowest in {np.nanmax(time):.1f} s, '
+            f'steps up to {np.nanmax(steps):.0f}, '
             f'funnels claim {(depth <= 1).mean():.0%}'
         )
     figure.colorbar(image, ax=panels, label='time until home, s', shrink=0.6, extend='max')
     figure.legend(
         handles=[
-            Patch(facecolor='white', edgecolor='0.4', label='nothing brings it home'),
+            Patch(facecolor='white', edgecolor='0.4', label='no preview comes home'),
             Patch(facecolor='white', edgecolor=BLACK, hatch='///', label='takes a step'),
             Line2D(
                 [], [], color=ORANGE, path_effects=[TICKS],
