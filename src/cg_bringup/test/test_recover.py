@@ -95,7 +95,8 @@ def test_robot_comes_home_along_the_tree_and_balances(tree):
                 node.destroy_node()
         finally:
             rclpy.try_shutdown()
-    assert modes[:2] == ['idle', 'following']
+    # Until the observer has seen some samples nothing may bring home what it believes.
+    assert [mode for mode in modes if mode != 'outside'][:2] == ['idle', 'following']
     assert modes[-1] == 'balancing'
     assert machine.exit_status == 0
     assert steps
@@ -130,16 +131,18 @@ def test_a_start_comes_home_and_is_not_there(tree):
         outside += Lookup(tree.nodes).best(leg, x).depth > 1.0
     assert outside > 2  # no funnel holds these
     with pytest.raises(TreeError, match='brings home none of'):
-        start_of(Tree(tree.nodes, 1e9 * tree.goal), MODEL, 1)
+        start_of(Tree(tree.nodes, 1e30 * tree.goal), MODEL, 1)
 
 
-def test_a_tree_may_be_of_the_robot_as_it_was_known_before(tree):
-    options = RecoverOptions(model='compass_gait_flexible', grown_for='compass_gait_mit')
+def test_a_tree_may_be_of_the_robot_as_it_was_known_before(tree, tmp_path):
+    loaded = tmp_path / 'loaded.yaml'
+    MODEL.with_effect('payload', 'inner', mass=1.0, distance=0.5).save(loaded)
+    options = RecoverOptions(model=str(loaded), grown_for='compass_gait_mit')
     nodes = recover_nodes(options)
     assert nodes['tree_server'].parameters['model_file'] == 'compass_gait_mit'
     assert nodes['tree_controller'].parameters['grown_for'] == 'compass_gait_mit'
     for name in ('tree_controller', 'observer'):
-        assert nodes[name].parameters['model_file'] == 'compass_gait_flexible'
+        assert nodes[name].parameters['model_file'] == str(loaded)
 
 
 def test_pushes_are_answered_by_steps_with_an_observer(tree):

@@ -125,7 +125,10 @@ class ReadyTree:
         ready = cls(tree, Lookup(nodes), Tracker(nodes, model), preview)
         # What is worked out once, when it is first asked for; the rollouts are compiled.
         _ = nodes.costs, nodes.to_go, nodes.steps
-        preview.choose(nodes.stance[:1], nodes.x0[:1])
+        try:
+            preview.choose(nodes.stance[:1], nodes.x0[:1])
+        except ValueError as error:
+            raise ValueError(f'{model.name!r} cannot be previewed: {error}') from None
         return ready
 
 

@@ -13,6 +13,7 @@ from cg_control.grow_tree import (
     BOX,
     GROWTH,
     LANDING,
+    REGION,
     Growing,
     grow,
     main,
@@ -92,8 +93,8 @@ def test_the_progress_tells_the_coverage_of_the_last_rounds():
 def test_a_checkpoint_is_gone_on_from_only_with_the_same_command(robot, tmp_path, capsys):
     path, part = tmp_path / 'tree.npz', tmp_path / 'tree.npz.part'
     grower = Grower(
-        robot, upright_tree(robot), Region(np.array(BOX)), Extension(robot),
-        replace(GROWTH, seed=3), simulation=LANDING,
+        robot, upright_tree(robot), REGION, Extension(robot), replace(GROWTH, seed=3),
+        simulation=LANDING,
     )  # fmt: skip
     grower.counts.samples, grower.rounds = 4 * GROWTH.round_size, 4
     Checkpoint.of(grower, goal='either', extension=ExtensionOptions()).save(part)

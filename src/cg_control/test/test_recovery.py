@@ -298,7 +298,7 @@ def test_it_brings_home_what_the_tree_brings_home(make, robot, tree, starts):
     grower = Grower(robot, tree, Region(np.array(BOX)), lambda *_: [], simulation=LANDING)
     claimed = grower.bring_home(node, x, learn=False)
     home = np.array([
-        comes_home(make(), robot, int(leg[k]), x[k]) for k in range(len(leg))
+        comes_home(make(preview=True), robot, int(leg[k]), x[k]) for k in range(len(leg))
     ])  # fmt: skip
     assert claimed.sum() > 45
     # Of robots that come home only just, one or the other falls: 3 of 279 in bench/trees_live.py.

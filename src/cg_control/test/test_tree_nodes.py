@@ -272,10 +272,12 @@ def test_another_tree_is_followed_from_the_next_state_on(bench, tree, start, tmp
     bench.select(node, tree_path('compass_gait_mit'))
     bench.tell(BEGIN, tree.nodes.x0[start])
     assert node.controller.node == start
-    # The roots alone: this state is nobody's any more.
+    # The roots alone, and nothing is home: this state is nobody's any more.
     path = tmp_path / 'roots.npz'
-    shrunk = replace(tree.nodes, rho=np.where(tree.nodes.planned < 0, 0.01, 0.0))
-    replace(tree, nodes=shrunk).save(path)
+    roots, _ = tree.nodes.pruned(np.array([], int))
+    roots.rho[:] = 0.01
+    none = np.zeros((2, 0), np.int32)
+    replace(tree, nodes=roots, goal=1e30 * tree.goal, champions=none).save(path)
     bench.select(node, path)
     assert bench.tell(BEGIN + PERIOD, tree.nodes.x0[start]) == 0.0
     assert node.controller.mode == 'outside'
