@@ -194,6 +194,8 @@ class TreeController:
         """Follow another tree from the next step on, or none."""
         if self.mode == FOLLOWING and self._ready is not ready:
             self._rest(IDLE)
+        if self._ready is not ready:
+            self._previewed_ns = None
         self._ready = ready
         if ready is not None:
             ready.tracker.settings = ready.preview.settings = self.settings.tracking
