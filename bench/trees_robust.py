@@ -9,7 +9,7 @@ its goal regions, which a preview of the nominal robot brings home: they are the
 A robot came home if it balances upright at the end of 4 s.
 
     balance     the balance controller alone
-    rebalance   that, and the one-step rebalance where the state leaves its basin
+    rebalance   that, and the one-step rebalance once the state has left its basin
     funnels     the tree, by its funnels alone
     previews    the tree, with previews on the robot as it is known
 
@@ -58,11 +58,14 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.high_gain import HighGainObserver
 
 DURATION, PUSHED_AT = 4.0, 0.5  # s
+LET_GO = 1.2  # depth in the basin at which the one-step rebalance begins
 IMPULSES = (3.0, 4.0)  # N s
 CONTROLLERS = ('balance', 'rebalance', 'funnels', 'previews')
 PAYLOADS = (('inner', 1.5, 0.4), ('inner', 1.2, 0.9), ('outer', 0.8, 0.7), ('outer', 2.0, 0.3))
 RESULT = Path(__file__).parent / 'results' / 'trees_robust.md'
 MODEL = Model.load(model_path('compass_gait_mit'))
+
+Payload = tuple[str, float, float]  # leg pair, kg, m above the foot
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class Condition:
     velocity_noise: float = 0.0
     torque_noise: float = 0.0
     epsilon: float | None = None
-    payload: tuple[str, float, float] | None = None
+    payload: Payload | None = None
     known: bool = False
 
     def robot(self, seed: int) -> Model:
@@ -97,9 +100,9 @@ class Condition:
         return robot
 
     @property
-    def model(self) -> Model:
-        """The robot as it is known."""
-        return loaded(self.payload) if self.payload and self.known else MODEL
+    def believed(self) -> Payload | None:
+        """The payload that the controllers know of."""
+        return self.payload if self.known else None
 
 
 CONDITIONS = (
@@ -123,15 +126,18 @@ CONDITIONS = (
 
 
 @cache
-def loaded(payload: tuple[str, float, float]) -> Model:
+def loaded(payload: Payload | None) -> Model:
     """The nominal robot with a payload."""
+    if payload is None:
+        return MODEL
     site, mass, height = payload
     return MODEL.with_effect('payload', site, mass=mass, distance=height)
 
 
 @cache
-def design(known: Model) -> tuple:
+def design(believed: Payload | None) -> tuple:
     """Gains and basins of the balance controller."""
+    known = loaded(believed)
     gains = balance_gains(known, BalanceSettings(), LANDING.sample_time)
     basins = shipped_basins(known, gains, known.torque_limit) or {
         leg: sample_basin(known, leg, gains[leg], known.torque_limit) for leg in STANCES
@@ -161,7 +167,7 @@ class Rebalance:
     def step(self, stamp_ns: int, stance: str, x: np.ndarray) -> Command:
         """The torque for a state."""
         command = self._controller.step(stamp_ns, stance, x)
-        if self.mode == BALANCING and self._balancing.basins[stance].depth(x) > 1.0:
+        if self.mode == BALANCING and self._balancing.basins[stance].depth(x) > LET_GO:
             self._controller.start(self._steps[stance])
         return command
 
@@ -210,14 +216,14 @@ def steps() -> dict:
 
 
 @cache
-def ready(known: Model) -> ReadyTree:
+def ready(believed: Payload | None) -> ReadyTree:
     """The tree on a robot as it is known."""
-    return ReadyTree.of(tree(), known)
+    return ReadyTree.of(tree(), loaded(believed))
 
 
-def controller_of(name: str, known: Model):
+def controller_of(name: str, believed: Payload | None):
     """A fresh controller."""
-    gains, basins = design(known)
+    known, (gains, basins) = loaded(believed), design(believed)
     settings = RecoverySettings(preview=name == 'previews')
     balancing = BalanceController(known, settings, gains, basins)
     if name == 'balance':
@@ -225,7 +231,7 @@ def controller_of(name: str, known: Model):
     if name == 'rebalance':
         return Rebalance(balancing, known, steps())
     found = TreeController(balancing, settings)
-    found.take(ready(known))
+    found.take(ready(believed))
     return found
 
 
@@ -237,7 +243,7 @@ def fares(job: tuple[int, str, str, int, int]) -> bool:
     """
     number, name, kind, k, count = job
     condition = CONDITIONS[number]
-    known, stance, x, pushes = condition.model, STANCES[k % 2], np.zeros(4), []
+    stance, x, pushes = STANCES[k % 2], np.zeros(4), []
     if kind == 'start':
         stance, x = starts(count)[k]
     else:
@@ -247,8 +253,8 @@ def fares(job: tuple[int, str, str, int, int]) -> bool:
     if condition.epsilon is None:
         observer = Known(plant)
     else:
-        observer = HighGainObserver(known, setup, condition.epsilon)
-    controller = Shaky(controller_of(name, known), condition, k)
+        observer = HighGainObserver(loaded(condition.believed), setup, condition.epsilon)
+    controller = Shaky(controller_of(name, condition.believed), condition, k)
     return balance(plant, observer, controller, DURATION, pushes).upright(DURATION)
 
 
