@@ -1,7 +1,7 @@
 """What following a tree costs in the running nodes, in lock-step and in real time.
 
     python bench/trees_nodes.py [--tree NAME] [--seconds 20] [--write]       needs ROS
-    ./cg run cg_control grow_tree --samples 4096 --out tree.npz             one of 10 000 nodes
+    ./cg run cg_control grow_tree --samples 3584 --out tree.npz             one of 10 000 nodes
 
 Six processes: machine, observer, tree server, tree controller, gate, and a listener that collects
 what the controller says on /diagnostics. The robot begins at a state that the tree brings home,

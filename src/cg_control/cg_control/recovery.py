@@ -315,8 +315,7 @@ class TreeController:
 
     def _previewed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> int:
         assert self._ready is not None
-        preview, tracker = self._ready.preview, self._ready.tracker
-        underway = self.mode == FOLLOWING and not tracker.left(stance)
+        underway = self.mode == FOLLOWING and not self._ready.tracker.left(stance)
         since = None if self._previewed_ns is None else (stamp_ns - self._previewed_ns) * 1e-9
         if since is not None and 0.0 <= since < self.settings.preview_period:
             if underway:
@@ -324,23 +323,27 @@ class TreeController:
             if self.mode == OUTSIDE:
                 return NOWHERE
         began = time.perf_counter()
-        leg = np.array([STANCES.index(stance)])
-        nodes = preview.candidates(leg, x[None])[0]
+        onto = self._way_home(stance, x, best, underway)
+        self._previewed_ns, self._verdict = stamp_ns, STAY if onto >= 0 else onto
+        self.preview_times.append(time.perf_counter() - began)
+        return onto
+
+    def _way_home(self, stance: str, x: np.ndarray, best: Claim, underway: bool) -> int:
+        """STAY, if the way that the robot is on brings it home; else a node that does."""
+        assert self._ready is not None
+        preview, tracker = self._ready.preview, self._ready.tracker
+        if underway:
+            # At a root time stands still, whatever the clock says.
+            elapsed = 0.0 if tracker.done else tracker.elapsed
+            here = np.array([tracker.node])
+            if preview.brings_home(here, x[None], np.array([elapsed]))[0]:
+                return STAY
+        nodes = preview.candidates(np.array([STANCES.index(stance)]), x[None])[0]
         nodes = nodes[nodes >= 0]
         if best.depth <= 1.0:
             nodes = np.concatenate([[best.node], nodes])
-        elapsed = np.zeros(len(nodes))
-        if underway:
-            # At a root time stands still, whatever the clock says.
-            now = 0.0 if tracker.done else tracker.elapsed
-            nodes = np.concatenate([[tracker.node], nodes])
-            elapsed = np.concatenate([[now], elapsed])
-        first = preview.first_home(nodes, np.repeat(x[None], len(nodes), axis=0), elapsed)
-        self._previewed_ns, self._verdict = stamp_ns, STAY if first >= 0 else NOWHERE
-        self.preview_times.append(time.perf_counter() - began)
-        if first < 0 or (underway and first == 0):
-            return self._verdict
-        return int(nodes[first])
+        first = preview.first_home(nodes, x)
+        return int(nodes[first]) if first >= 0 else NOWHERE
 
     def _waited(self, stamp_ns: int, here: float) -> bool:
         """Whether the robot gives its node up. One whose plan is over has no choice."""
