@@ -157,7 +157,7 @@ def pruned_rows(tree: Tree) -> list[str]:
         covered, false = judged(one, by_previews)
         own, wrong = judged(one, by_funnels)
         rows.append(
-            f'| {count or "all"} | {len(np.unique(one.nodes.branch)) - 1} | {len(one.nodes)} '
+            f'| {count or "all"} | {one.nodes.branches} | {len(one.nodes)} '
             f'| {covered} | {false} | {own} | {wrong} |'
         )
         print(rows[-1], flush=True)

@@ -168,7 +168,7 @@ def main() -> None:
         f'`python bench/trees_live.py --tree {options.tree} --starts {options.starts} --pushes '
         f'{options.pushes} --write`, Python {platform.python_version()}, '
         f'{multiprocessing.cpu_count()} cores. What is counted is said at the top of the script. '
-        f'Tree: {len(tree.nodes)} nodes, {len(np.unique(tree.nodes.branch)) - 1} branches.',
+        f'Tree: {len(tree.nodes)} nodes, {tree.nodes.branches} branches.',
         '',
         '| starts that the tree brings home | came home | node switches, mean | largest |',
         '|---|---|---:|---:|',

@@ -276,9 +276,8 @@ def main(args: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f'grow_tree: {error}', file=sys.stderr)
         return 2
-    branches = len(np.unique(tree.nodes.branch)) - 1
     print(
-        f'grow_tree: {options.out}: {len(tree.nodes)} nodes in {branches} branches, '
+        f'grow_tree: {options.out}: {len(tree.nodes)} nodes in {tree.nodes.branches} branches, '
         f'upright on the {" or ".join(tree.legs)} leg'
     )
     return 0

@@ -291,6 +291,11 @@ class Nodes:
         return replace(rows, next=then, landing=landing), place
 
     @functools.cached_property
+    def branches(self) -> int:
+        """How many trajectories there are; pruned trees keep the numbers of those they keep."""
+        return len(np.unique(self.branch[self.branch > 0]))
+
+    @functools.cached_property
     def entries(self) -> np.ndarray:
         """The roots and the first node of every trajectory: where motions begin, shape (m,)."""
         _, first = np.unique(self.branch, return_index=True)

@@ -25,7 +25,7 @@ funnels need neither `hold` nor `margin`: the way that the robot is on is simula
 import collections
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -199,6 +199,11 @@ class TreeController:
         self._ready = ready
         if ready is not None:
             ready.tracker.settings = ready.preview.settings = self.settings.tracking
+            # Beyond these angles nothing is followed, so nothing is promised either.
+            ready.preview.simulation = replace(
+                LANDING, fall_angle=self.settings.fall_angle,
+                swing_angle=self.settings.largest_swing,
+            )  # fmt: skip
 
     def interrupt(self) -> None:
         """States were missing: what was known of the motion is void."""

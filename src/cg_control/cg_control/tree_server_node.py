@@ -92,7 +92,7 @@ class TreeServerNode(Node):
         self.selected.publish(String(data=selection.text()))
         self.show(-1)
         self.get_logger().info(
-            f'{settings.tree}: {len(tree.nodes)} nodes in {int(tree.nodes.branch.max())} branches '
+            f'{settings.tree}: {len(tree.nodes)} nodes in {tree.nodes.branches} branches '
             f'to upright on the {" or ".join(tree.legs)} leg'
         )
 

@@ -184,4 +184,5 @@ def test_a_pruned_tree_keeps_what_a_branch_ends_on(robot, step, back):
     np.testing.assert_array_equal(whole.landing >= 0, both.landing[kept] >= 0)
     alone, _ = both.pruned(np.array([3]))
     assert sorted(np.unique(alone.branch)) == [0, 3]
+    assert (alone.branches, whole.branches, both.branches) == (1, 2, 3)
     np.testing.assert_array_equal(alone.to_go[1:], both.to_go[both.branch == 3])

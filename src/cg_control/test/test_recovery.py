@@ -380,3 +380,18 @@ def test_it_brings_home_what_a_preview_promises(make, robot, promised):
     # The balance controller takes over in the end, which previews do not simulate.
     assert home[True] >= 19
     assert home[False] <= 10
+
+
+@COMPILED
+def test_what_would_not_be_followed_is_not_promised(make, promised):
+    """The same limits hold for previews and for the robot."""
+    leg, x, _ = (rows[:20] for rows in promised)
+    modes = {
+        swing: [
+            tell(make(preview=True, largest_swing=swing), 0, int(leg[k]), x[k]).mode
+            for k in range(20)
+        ]
+        for swing in (2.0, 1.05)
+    }
+    assert modes[2.0].count(FOLLOWING) == 20
+    assert modes[1.05].count(FOLLOWING) < 15
