@@ -39,6 +39,7 @@ SCHEMA = Form({
         'torque': Key(ListOf(Number(), 2), unit='N m'),
         'gains': Key(ROWS, default=()),
         'cost_to_go': Key(ListOf(ROWS, 2), default=()),
+        'normals': Key(ROWS, default=()),
     }), 1)),
 })  # fmt: skip
 
@@ -49,12 +50,16 @@ class TrajectoryError(ValueError):
 
 @dataclass(frozen=True)
 class Point:
-    """A trajectory at one instant: state (nx,), torque in N m, gain (nx,), cost to go (nx, nx)."""
+    """A trajectory at one instant: state (nx,), torque in N m, gain (nx,), cost to go (nx, nx).
+
+    And the normal of the transversal surface there, shape (nx,).
+    """
 
     state: np.ndarray
     torque: float
     gain: np.ndarray
     cost_to_go: np.ndarray
+    normal: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class Phase:
         torque: Nominal hip torque at the knots, shape (n,), N m.
         gains: K of u = u0 - K (x - x0), shape (n, nx); zero without feedback.
         cost_to_go: S of x'Sx, shape (n, nx, nx); zero without feedback.
+        normals: n of the transversal surfaces n'(x - x0) = 0, scaled so that n'dx0/dt = 1,
+            shape (n, nx); zero without surfaces.
     """
 
     stance: str
@@ -78,11 +85,12 @@ class Phase:
     torque: np.ndarray
     gains: np.ndarray = field(default_factory=lambda: np.zeros(0))
     cost_to_go: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    normals: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self):
         if self.stance not in STANCES:
             raise TrajectoryError(f'stance is {self.stance!r}; allowed are {", ".join(STANCES)}')
-        for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go'):
+        for name in (f.name for f in fields(self)[1:]):
             try:
                 object.__setattr__(self, name, np.array(getattr(self, name), float))
             except (TypeError, ValueError):
@@ -91,11 +99,11 @@ class Phase:
         nx = np.shape(self.states)[-1] if np.ndim(self.states) == 2 else 0
         shapes = {
             'time': (n,), 'states': (n, nx), 'rates': (n, nx), 'torque': (n,),
-            'gains': (n, nx), 'cost_to_go': (n, nx, nx),
+            'gains': (n, nx), 'cost_to_go': (n, nx, nx), 'normals': (n, nx),
         }  # fmt: skip
         for name, shape in shapes.items():
             array = getattr(self, name)
-            if name in ('gains', 'cost_to_go') and array.size == 0:
+            if name in ('gains', 'cost_to_go', 'normals') and array.size == 0:
                 array = np.zeros(shape)
             if array.shape != shape:
                 raise TrajectoryError(f'{name} has shape {array.shape}, expected {shape}')
@@ -127,10 +135,11 @@ class Phase:
             + (1 + 2 * r) * s**2 * self.states[i + 1]
             + h * s * r * (r * self.rates[i] - s * self.rates[i + 1])
         )
-        torque, gain, cost_to_go = (
-            r * a[i] + s * a[i + 1] for a in (self.torque, self.gains, self.cost_to_go)
+        torque, *rest = (
+            r * a[i] + s * a[i + 1]
+            for a in (self.torque, self.gains, self.cost_to_go, self.normals)
         )
-        return Point(state, float(torque), gain, cost_to_go)
+        return Point(state, float(torque), *rest)
 
 
 @dataclass(frozen=True)

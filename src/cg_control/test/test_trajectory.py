@@ -43,7 +43,7 @@ def test_file_gives_back_every_bit(tmp_path, trajectory, model):
     back = Trajectory.load(path, model)
     for a, b in zip(trajectory.phases, back.phases, strict=True):
         assert a.stance == b.stance
-        for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go'):
+        for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go', 'normals'):
             assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
     assert back.provenance == trajectory.provenance
     assert back.model_hash == model.hash
