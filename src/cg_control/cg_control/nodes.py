@@ -4,9 +4,9 @@ A node is a knot of a trajectory. From node i the reference moves to `next[i]` w
 seconds, on the same leg; when the foot lands it jumps to `landing[i]`, which is where the next
 impact ahead leads. Between two nodes the state is the cubic of trajectory.py, torque, gain and
 cost to go are linear. A trajectory that ends on another one is grafted there, by a link: a node
-whose span is zero. Every way ends at a root, where the reference rests and the gain is that of
-the balance controller. What the reference does while an impact is late are nodes too, but no
-state is claimed by them.
+whose span is zero. Every way ends at a home: a root, where the reference rests and the gain is
+that of the balance controller, or an orbit, on which it goes round for ever. What the reference
+does while an impact is late are nodes too, but no state is claimed by them.
 
     x0 ----> x1 ----> x2 (impact) - - > late - - > late, rests      next, on the first leg
      \________\________\___________________/
@@ -28,9 +28,11 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 
+STILL = 1e-3  # at rest every point is equally close: this much of trace(F) counts against that
 LATE = 0.3  # s for which the reference goes on while an impact is late
 LATE_KNOT = 0.01  # s between its knots
 FALLING = 1.0  # rad at which it ends
+SLOWEST = 0.05  # rad/s across a surface: more slowly it says nothing about the phase
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,16 @@ class Nodes:
         u0: Nominal torque in N m, shape (n,).
         K: Gains of u = u0 - K (x - x0), shape (n, nx).
         S: Cost to go of a deviation, shape (n, nx, nx).
-        F: Form of the funnel, shape (n, nx, nx): S, unless another one was given.
+        F: Form of the funnel, shape (n, nx, nx): S, unless another one was given. At an orbit the
+            tube (x - x0)' F (x - x0) <= 1 is home.
+        normal: n of the transversal surface n'(x - x0) = 0, with n'dx0/dt = 1, shape (n, nx);
+            zero where none was designed: `surfaces` says what counts there.
         span: Time to `next` in s; 0 is a link, infinite is rest: shape (n,).
         next: Successor in time on the same leg, -1 at rest, shape (n,).
         landing: Where the reference goes when the foot lands, -1 where no impact is ahead: (n,).
         late: Whether the node lies beyond a late impact, shape (n,).
         time: Instant on the clock of its trajectory in s, shape (n,).
-        branch: Number of the trajectory that brought it, 0 is a root, shape (n,).
+        branch: Number of the trajectory that brought it, 0 is a home, shape (n,).
         rho: Level of the funnel, x claimed by a node if (x - x0)' F (x - x0) <= rho: infinite
             until cut. 0, which claims nothing, beyond a late impact and at a planned one: there
             the foot is on the ground, and it depends on rounding whether it has landed. Shape
@@ -66,6 +71,7 @@ class Nodes:
     K: np.ndarray
     S: np.ndarray
     F: np.ndarray
+    normal: np.ndarray
     span: np.ndarray
     next: np.ndarray
     landing: np.ndarray
@@ -109,7 +115,8 @@ class Nodes:
         whole, zero = np.zeros(1, np.int32), np.zeros(1)
         return cls(
             whole + STANCES.index(stance), np.zeros((1, nx)), np.zeros((1, nx)), zero, K[None],
-            S[None], F[None], zero + math.inf, whole - 1, whole - 1, np.zeros(1, bool),
+            S[None], F[None], np.zeros((1, nx)), zero + math.inf, whole - 1, whole - 1,
+            np.zeros(1, bool),
             zero.copy(), whole, zero + rho, model_hash, compensate,
         )  # fmt: skip
 
@@ -137,6 +144,35 @@ class Nodes:
         )
         return root.grafted(trajectory, model, 0, late=late)
 
+    @classmethod
+    def orbit(
+        cls,
+        trajectory: Trajectory,
+        model: Model,
+        tubes: Sequence[np.ndarray] | None = None,
+        late: float = LATE,
+    ) -> 'Nodes':
+        """A periodic motion: when its last foot has landed, the reference goes on at its start.
+
+        Args:
+            trajectory: Periodic, with gains.
+            model: The robot that it was planned for.
+            tubes: Forms F of its tube at the knots of each phase, shapes (n, nx, nx); None: S.
+            late: As in `grafted`.
+
+        Raises:
+            TrajectoryError: for another model, or a motion that is not periodic.
+        """
+        trajectory.require_model(model)
+        if not trajectory.provenance.get('periodic') or len(trajectory.phases) % 2:
+            raise TrajectoryError('an orbit needs a periodic motion of an even number of steps')
+        first = trajectory.phases[0]
+        frame = cls.root(
+            first.stance, first.gains[0], first.cost_to_go[0], trajectory.model_hash,
+            trajectory.provenance.get('friction') == 'to be compensated',
+        )  # fmt: skip
+        return _concatenated(_chained(trajectory, model, frame, 0, 0, 0, tubes, late))
+
     def __len__(self) -> int:
         return len(self.stance)
 
@@ -152,7 +188,8 @@ class Nodes:
             TrajectoryError: naming the array, the node and what is allowed.
         """
         n, nx = len(self), self.x0.shape[-1]
-        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'S': (nx, nx), 'F': (nx, nx)}
+        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'normal': (nx,)}
+        tails |= {'S': (nx, nx), 'F': (nx, nx)}
         for name in ARRAYS:
             array, shape = getattr(self, name), (n, *tails.get(name, ()))
             if np.shape(array) != shape:
@@ -236,22 +273,10 @@ class Nodes:
                 'friction is planned in one of trajectory and tree, and compensated in the other'
             )
         tree, place = self._opened(onto, elapsed)
-        number = int(tree.branch.max()) + 1
-        last = len(trajectory.phases) - 1
-        blocks = [
-            _block(
-                phase, number, self, phase.cost_to_go if funnels is None else funnels[i],
-                *_beyond(phase, model, self, late if i < last else 0.0),
-            )
-            for i, phase in enumerate(trajectory.phases)
-        ]
-        starts = np.cumsum([len(tree), *map(len, blocks)])
-        for i, block in enumerate(blocks):
-            block.next[:-1] += starts[i]
-            block.landing[:] = starts[i + 1] if i < last else tree.landing[place]
-            if i < last:
-                block.rho[len(trajectory.phases[i].time) - 1] = 0.0
-        blocks[last].next[-1], blocks[last].span[-1] = place, 0.0
+        blocks = _chained(
+            trajectory, model, tree, int(tree.branch.max()) + 1, len(tree),
+            int(tree.landing[place]), funnels, late, place,
+        )  # fmt: skip
         return _concatenated([tree, *blocks])
 
     def joined(self, other: 'Nodes') -> 'Nodes':
@@ -297,9 +322,9 @@ class Nodes:
 
     @functools.cached_property
     def entries(self) -> np.ndarray:
-        """The roots and the first node of every trajectory: where motions begin, shape (m,)."""
+        """The homes and the first node of every trajectory: where motions begin, shape (m,)."""
         _, first = np.unique(self.branch, return_index=True)
-        return np.union1d(first, np.flatnonzero(self.planned < 0))
+        return np.union1d(first, np.flatnonzero(self.home & ~self.impact))
 
     @property
     def impact(self) -> np.ndarray:
@@ -313,24 +338,66 @@ class Nodes:
         return np.where(self.impact | self.late, self.landing, self.next)
 
     @functools.cached_property
+    def orbiting(self) -> np.ndarray:
+        """Whether a node lies on an orbit, shape (n,): the plan leads from there back to it."""
+        at = np.where(self.planned < 0, np.arange(len(self)), self.planned)
+        # Each round looks twice as far ahead; in the end only roots and orbits are left.
+        for _ in range(len(self).bit_length()):
+            at = at[at]
+        found = np.zeros(len(self), bool)
+        found[at] = True
+        return found & (self.planned >= 0)
+
+    @property
+    def home(self) -> np.ndarray:
+        """Whether a node is a root or lies on an orbit, shape (n,)."""
+        return (self.planned < 0) | self.orbiting
+
+    @functools.cached_property
+    def orbit_of(self) -> np.ndarray:
+        """Number of the orbit that a node lies on or leads to, in the order of their first nodes.
+
+        -1 where it leads to a root, shape (n,).
+        """
+        number = np.full(len(self), -1)
+        count = 0
+        for node in np.flatnonzero(self.orbiting):
+            if number[node] >= 0:
+                continue
+            while number[node] < 0:
+                number[node], node = count, self.planned[node]
+            count += 1
+        return number[self._end]
+
+    @functools.cached_property
     def to_go(self) -> np.ndarray:
-        """Nominal time to the root in s, shape (n,); NaN if the way leads round for ever."""
+        """Nominal time until home in s, shape (n,)."""
         return self._along(np.where(self.impact | self.late, 0.0, self.span))
 
     @functools.cached_property
     def steps(self) -> np.ndarray:
-        """Impacts that are planned between a node and its root, shape (n,); NaN as `to_go`."""
+        """Impacts that are planned between a node and its home, shape (n,)."""
         return self._along((self.impact | self.late).astype(float))
 
     def _along(self, step: np.ndarray) -> np.ndarray:
-        """Sum of what each node of the plan adds, from there to the root."""
-        planned = self.planned
-        ends = planned < 0
-        total, at = np.where(ends, 0.0, step), np.where(ends, np.arange(len(self)), planned)
-        # Each round looks twice as far ahead.
+        """Sum of what each node of the plan adds, from there to its home."""
+        total, at = np.where(self.home, 0.0, step), self._ahead
         for _ in range(len(self).bit_length()):
             total, at = total + total[at], at[at]
-        return np.where(ends[at], total, math.nan)
+        return total
+
+    @functools.cached_property
+    def _ahead(self) -> np.ndarray:
+        """`planned`, but a home stays where it is."""
+        return np.where(self.home, np.arange(len(self)), self.planned)
+
+    @functools.cached_property
+    def _end(self) -> np.ndarray:
+        """The first node of its home that the plan leads to, shape (n,)."""
+        at = self._ahead
+        for _ in range(len(self).bit_length()):
+            at = at[at]
+        return at
 
     @functools.cached_property
     def edges(self) -> np.ndarray:
@@ -361,6 +428,23 @@ class Nodes:
         h = np.where(moves, self.span, 1.0)[:, None, None]
         slope = np.where(moves[:, None, None], (self.F[then] - self.F) / h, 0.0)
         return np.stack([self.F, slope], axis=1)
+
+    @functools.cached_property
+    def surfaces(self) -> np.ndarray:
+        """Normals on the way to `next`: value and what they grow by in a second: (n, 2, nx).
+
+        Where no surface was designed x0 is the point that is closest in the metric of F, and
+        n = F t / (t'F t + 0.001 tr F) with t = dx0/dt: at rest every point is equally close.
+        """
+        along = np.einsum('nij,nj->ni', self.F, self.rates)
+        trace = np.trace(self.F, axis1=1, axis2=2)
+        length = np.einsum('ni,ni->n', along, self.rates) + STILL * trace
+        designed = self.normal.any(axis=1)[:, None]
+        found = np.where(designed, self.normal, along / length[:, None])
+        moves = np.isfinite(self.span) & (self.span > 0)
+        then = np.where(moves, self.next, 0)
+        h = np.where(moves, self.span, 1.0)[:, None]
+        return np.stack([found, np.where(moves[:, None], (found[then] - found) / h, 0.0)], axis=1)
 
     @functools.cached_property
     def forms(self) -> np.ndarray:
@@ -400,18 +484,25 @@ class Nodes:
             one, x0=x0[None], u0=u0, K=K[None],
             rates=(slopes @ self.edges[onto])[None, 1 : 1 + nx],
             S=self.at(onto, elapsed)[None],
+            normal=self._normal_at(onto, elapsed)[None],
             F=(self.costs[onto, 0] + elapsed * self.costs[onto, 1])[None],
             span=one.span - elapsed, time=one.time + elapsed, rho=np.full(1, math.inf),
         )  # fmt: skip
         return _concatenated([self, point]), len(self)
+
+    def _normal_at(self, node: int, elapsed: float) -> np.ndarray:
+        """Normal of the designed surface at a point of the tree; zero where there is none."""
+        if not self.normal[node].any() or not self.normal[self.next[node]].any():
+            return np.zeros_like(self.normal[node])
+        return self.surfaces[node, 0] + elapsed * self.surfaces[node, 1]
 
     def _rows(self, rows: np.ndarray) -> 'Nodes':
         return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
 
 ARRAYS = (
-    'stance', 'x0', 'rates', 'u0', 'K', 'S', 'F', 'span', 'next', 'landing', 'late', 'time',
-    'branch', 'rho',
+    'stance', 'x0', 'rates', 'u0', 'K', 'S', 'F', 'normal', 'span', 'next', 'landing', 'late',
+    'time', 'branch', 'rho',
 )  # fmt: skip
 
 
@@ -426,6 +517,34 @@ def _concatenated(parts: list[Nodes]) -> Nodes:
         name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS
     }
     return replace(parts[0], **arrays)
+
+
+def _chained(
+    trajectory: Trajectory, model: Model, tree: Nodes, number: int, place: int, landing: int,
+    forms: Sequence[np.ndarray] | None, late: float, onto: int | None = None,
+) -> list[Nodes]:
+    """The nodes of each phase; the first gets index `place`.
+
+    Without a node `onto` that it ends on, the last phase ends with an impact, as the others do.
+    `landing` is where an impact in the last phase leads.
+    """  # fmt: skip
+    last = len(trajectory.phases) - 1
+    blocks = []
+    for i, phase in enumerate(trajectory.phases):
+        lands = i < last or onto is None
+        beyond = _beyond(phase, model, tree, late if lands else 0.0)
+        form = phase.cost_to_go if forms is None else forms[i]
+        block = _block(phase, number, tree, form, *beyond)
+        if lands:
+            block.rho[len(phase.time) - 1] = 0.0
+        blocks.append(block)
+    starts = place + np.cumsum([0, *map(len, blocks)])
+    for i, block in enumerate(blocks):
+        block.next[:-1] += starts[i]
+        block.landing[:] = starts[i + 1] if i < last else landing
+    if onto is not None:
+        blocks[last].next[-1], blocks[last].span[-1] = onto, 0.0
+    return blocks
 
 
 def _block(
@@ -446,6 +565,7 @@ def _block(
         K=phase.gains[held],
         S=phase.cost_to_go[held],
         F=funnel[held],
+        normal=np.vstack([phase.normals, _scaled(phase.normals[-1], rates)]),
         span=np.append(np.diff(instants), math.inf),
         next=np.append(np.arange(1, n), -1).astype(np.int32),
         landing=np.full(n, -1, np.int32),
@@ -454,6 +574,13 @@ def _block(
         branch=np.full(n, number, np.int32),
         rho=np.where(late, 0.0, math.inf),
     )
+
+
+def _scaled(normal: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """The surface of an impact while it is late: one normal (nx,), n'dx0/dt = 1: (n, nx)."""
+    speed = rates @ normal
+    moves = speed > SLOWEST * np.linalg.norm(normal)
+    return np.where(moves[:, None], normal / np.where(moves, speed, 1.0)[:, None], 0.0)
 
 
 def _beyond(

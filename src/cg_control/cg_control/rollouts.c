@@ -7,7 +7,7 @@
    and, if COMPENSATE, of the known model:
      prepare_taken(p, c), taken(angle and rate of the hip, u, c, torque)
    and the sizes NX, NU, NP, NL (states that the law looks at), CONSTANTS, NK (parameters of the
-   known model), and STILL of the law.
+   known model), and LEAST_TURN of the law.
 
    The law is (FOL) of docs/trajectories.md, the same as in tracking.py; events are those of
    cg_dynamics/hybrid.py. Rollouts have clocks of their own: a lane that ends takes the next one
@@ -24,11 +24,11 @@
 enum { RUNNING, ARRIVED, FALLEN, LEFT, TIMED_OUT };
 
 struct job {
-    /* The tree: leg, next, landing, late, span (n), edge (n, 4, LAW), cost (n, 2, FORM); what
-       the controller knows, (NK). */
+    /* The tree: leg, next, landing, late, orbit, span (n), edge (n, 4, LAW), cost (n, 2, FORM),
+       normal (n, 2, NL); what the controller knows, (NK). */
     const int *leg, *next, *landing;
-    const unsigned char *late;
-    const double *span, *edge, *cost, *known;
+    const unsigned char *late, *orbit;
+    const double *span, *edge, *cost, *normal, *known;
     /* Goal forms (2, FORM) or null; parameters (NP), or (B, NP) if p_each. */
     const double *goal, *p;
     /* Rollouts, in and out: (B, NX), (B), (B), (B). */
@@ -62,7 +62,9 @@ struct queue {
 
 struct lanes {
     vd x[NX], u[NU], h, elapsed, left, tick, samples, span, edge[4][LAW], form[2][FORM];
+    vd normal[2][NL];
     vd c[CONSTANTS], landing[CONSTANTS], length;
+    vi orbit;           /* on an orbit, whose tube is a goal */
     vi busy, strange;   /* strange: at the start, or on a leg that is not the node's */
     long number[WIDTH]; /* -1: idle */
     struct walk *walk[WIDTH];
@@ -101,7 +103,12 @@ static void enter(const struct job *job, struct lanes *l, int j)
     const double *cost = job->cost + (long)node * 2 * FORM;
     for (int k = 0; k < 4; k++)
         for (int i = 0; i < LAW; i++) l->edge[k][i][j] = edge[k * LAW + i];
+    const double *normal = job->normal + (long)node * 2 * NL;
     if (job->pull > 0)
+        for (int k = 0; k < 2; k++)
+            for (int i = 0; i < NL; i++) l->normal[k][i][j] = normal[k * NL + i];
+    l->orbit[j] = job->goal && job->orbit[node] ? -1 : 0;
+    if (l->orbit[j])
         for (int k = 0; k < 2; k++)
             for (int i = 0; i < FORM; i++) l->form[k][i][j] = cost[k * FORM + i];
 }
@@ -138,25 +145,40 @@ static void advance(const struct job *job, struct lanes *l, int j, int st)
     }
 }
 
-/* ds/dt of the phase law. */
-static vd phase_rate(const struct job *job, const struct lanes *l)
+/* How far a lane's robot is from its reference. */
+static inline void deviation(const struct lanes *l, vd *d)
 {
-    vd s = l->elapsed, tangent[NL], d[NL], length = SPLAT(0.0), offset = length, trace = length;
+    vd s = l->elapsed;
     for (int i = 0; i < NL; i++) {
         const int e = 1 + i;
-        tangent[i] = (3.0 * l->edge[3][e] * s + 2.0 * l->edge[2][e]) * s + l->edge[1][e];
         d[i] = l->x[i]
                - (((l->edge[3][e] * s + l->edge[2][e]) * s + l->edge[1][e]) * s + l->edge[0][e]);
     }
-    for (int i = 0, k = 0; i < NL; i++)
-        for (int j = i; j < NL; j++, k++) {
-            vd S = l->form[0][k] + s * l->form[1][k];
-            length += S * tangent[i] * tangent[j];
-            offset += 0.5 * S * (tangent[i] * d[j] + tangent[j] * d[i]);
-            if (i == j) trace += S;
-        }
-    vd rate = 1.0 + job->pull * offset / (length + STILL * trace);
+}
+
+/* ds/dt of the phase law. */
+static vd phase_rate(const struct job *job, const struct lanes *l)
+{
+    vd d[NL], ahead = SPLAT(0.0), turn = ahead;
+    deviation(l, d);
+    for (int i = 0; i < NL; i++) {
+        ahead += (l->normal[0][i] + l->elapsed * l->normal[1][i]) * d[i];
+        turn += l->normal[1][i] * d[i];
+    }
+    ahead /= v_fmax(1.0 - turn, SPLAT(LEAST_TURN));
+    vd rate = 1.0 + job->pull * (ahead - job->sample_time);
     return v_fmin(v_fmax(rate, SPLAT(1.0 / job->fastest)), SPLAT(job->fastest));
+}
+
+/* Lanes that are in the tube of an orbit. */
+static vi in_tube(const struct lanes *l)
+{
+    vd d[NL], cost = SPLAT(0.0);
+    deviation(l, d);
+    for (int i = 0, k = 0; i < NL; i++)
+        for (int j = i; j < NL; j++, k++)
+            cost += (l->form[0][k] + l->elapsed * l->form[1][k]) * d[i] * d[j];
+    return l->orbit & (cost <= 1.0);
 }
 
 static void empty(struct lanes *l, int j)
@@ -341,6 +363,9 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
                 for (int i = 0, k = 0; i < NL; i++)
                     for (int j = i; j < NL; j++, k++) away += goal[k] * l.x[i] * l.x[j];
                 arrived = asks & (away <= 1.0);
+                /* On the leg of its node: another one has not moved the reference yet. */
+                vi orbit = asks & l.orbit & ~l.strange;
+                if (any(orbit)) arrived |= orbit & in_tube(&l);
             }
             vd rate = job->pull > 0 ? phase_rate(job, &l) : SPLAT(1.0);
             l.elapsed = v_select(asks & ~l.strange, l.elapsed + rate * T, l.elapsed);

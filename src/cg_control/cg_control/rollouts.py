@@ -21,7 +21,7 @@ import numpy as np
 
 from cg_control.friction import friction_parameters, friction_torque
 from cg_control.nodes import Nodes, triangles
-from cg_control.tracking import STILL, Tracker, TrackingSettings
+from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
 from cg_dynamics.batch import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 from cg_dynamics.c_compiler import compiler, shared_library
@@ -41,9 +41,10 @@ SAMPLE_TIME = 0.002  # s
 LENGTH = 'leg_length'
 # Of struct job in rollouts.c, in its order.
 FIELDS: dict[Any, tuple[str, ...]] = {
-    ctypes.c_void_p: ('leg', 'next', 'landing', 'late', 'span', 'edge', 'cost', 'known', 'goal',
-                      'p', 'x', 'elapsed', 'node', 'stance', 'samples', 'clock', 'outcome',
-                      'impacts', 'time', 'visited', 'visit_cost', 'visit_state'),
+    ctypes.c_void_p: ('leg', 'next', 'landing', 'late', 'orbit', 'span', 'edge', 'cost',
+                      'normal', 'known', 'goal', 'p', 'x', 'elapsed', 'node', 'stance', 'samples',
+                      'clock', 'outcome', 'impacts', 'time', 'visited', 'visit_cost',
+                      'visit_state'),
     ctypes.c_double: ('pull', 'fastest', 'limit', 'sample_time', 'step', 'fall_angle',
                       'swing_angle', 'minimum_step', 'ahead', 'slope'),
     ctypes.c_long: ('p_each', 'visits', 'length_at'),
@@ -53,7 +54,7 @@ FIELDS: dict[Any, tuple[str, ...]] = {
 class Outcome(enum.IntEnum):
     """How a rollout ended."""
 
-    ARRIVED = 1  # in the goal region, on its leg
+    ARRIVED = 1  # in the goal region of its leg, or in the tube of an orbit
     FALLEN = 2  # a leg is too far from upright, or the state ran away
     LEFT = 3  # the foot landed where no impact is planned
     TIMED_OUT = 4
@@ -128,7 +129,8 @@ def follow(
         x: State of each, shape (B, 4); or (B, nx) with the states of effects.
         duration: Time for all or for each in s, in whole samples (rounded up), () or (B,).
         goal: Goal region x' F x <= 1 of each stance leg, shape (2, 4, 4), NaN on a leg without;
-            a robot that is inside at a sample has arrived. None: nobody arrives.
+            a robot that is inside at a sample has arrived, and so has one that follows an orbit
+            and is in its tube. None: nobody arrives.
         elapsed: Time since the start node at the start in s, shape (B,); None: zero.
         known: The robot as the controller knows it; None: as it is.
         p: Parameter vectors in place of those of `robot`, shape (np,) or (B, np).
@@ -203,10 +205,11 @@ class _Work:
         arrays = {
             'leg': _whole(nodes.stance), 'next': _whole(nodes.next),
             'landing': _whole(nodes.landing), 'late': np.ascontiguousarray(nodes.late),
+            'orbit': np.ascontiguousarray(nodes.orbiting),
             'span': np.ascontiguousarray(nodes.span), 'edge': nodes.edges,
-            'cost': nodes.forms, 'known': friction_parameters(known),
-            'goal': forms, 'p': self.p, 'x': self.x, 'elapsed': self.elapsed, 'node': self.node,
-            'stance': self.stance, 'samples': self.samples,
+            'cost': nodes.forms, 'normal': np.ascontiguousarray(nodes.surfaces),
+            'known': friction_parameters(known), 'goal': forms, 'p': self.p, 'x': self.x,
+            'elapsed': self.elapsed, 'node': self.node, 'stance': self.stance, 'samples': self.samples,
             'clock': _whole([name in CLOCKS for name in compiled.input_names]),
             'outcome': self.outcome, 'impacts': self.impacts, 'time': self.time,
             'visited': self.visited, 'visit_cost': self.visit_cost,
@@ -254,7 +257,7 @@ class _Work:
     def _one(self, b: int, move: 'Mover', tracker: Tracker, how: WalkOptions) -> None:
         nodes, nl = self.nodes, self.nodes.x0.shape[1]
         leg, x, tick, seen = int(self.stance[b]), self.x[b].copy(), 0, 0
-        while not (outcome := self._outcome(b, leg, x, tick, tracker.node, how)):
+        while not (outcome := self._outcome(b, leg, x, tick, tracker, how)):
             t, node = tick * how.sample_time, tracker.node
             torque = tracker.torque(t, STANCES[leg], x)
             passed = _passed(nodes, node, tracker.node, leg)
@@ -275,11 +278,16 @@ class _Work:
         self.time[b] = tick * how.sample_time
         self.node[b], self.elapsed[b] = tracker.node, tracker.elapsed
 
-    def _outcome(self, b: int, leg: int, x, tick: int, node: int, how) -> int:
+    def _outcome(self, b: int, leg: int, x, tick: int, tracker: Tracker, how) -> int:
         """An `Outcome`, or zero while the rollout goes on."""
         motion = x[: self.nodes.x0.shape[1]]
+        node, elapsed = tracker.node, tracker.elapsed
         if self.goal is not None and motion @ self.goal[leg] @ motion <= 1.0:
             return Outcome.ARRIVED
+        on_orbit = self.nodes.orbiting[node] and self.nodes.stance[node] == leg
+        if self.goal is not None and on_orbit:
+            if self.nodes.cost_to_go(node, elapsed, motion) <= 1.0:
+                return Outcome.ARRIVED
         swings = self.hybrid and not abs(x[1 - leg]) < how.swing_angle
         if swings or not abs(x[leg]) < how.fall_angle:
             return Outcome.FALLEN
@@ -403,7 +411,7 @@ def rollout_source(robot: Model, compensated: Model | None) -> str:
         'NL': 2 * compiled[0].equations.coordinates, 'HYBRID': int(hybrid),
         'COMPENSATE': int(friction is not None),
         'NK': 0 if friction is None else friction.size1_in(2), 'CONSTANTS': constants,
-        'STILL': STILL,
+        'LEAST_TURN': LEAST_TURN,
     }  # fmt: skip
     _sources[key] = '\n'.join([
         *(f'#define {name} {value}' for name, value in sizes.items()),

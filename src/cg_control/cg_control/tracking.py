@@ -8,7 +8,7 @@ if the robot lands earlier or later they belong to the wrong leg. The remedies d
     event   the phase is that of the leg that stands; at the impact s jumps to the nominal one.
             Until a late impact the reference goes on as the model would
     phase   as event, and s follows the robot: it runs faster or slower towards the point of the
-            reference that is closest in the metric of the cost to go
+            reference on whose transversal surface the robot is
 
 `event` and `phase` are one law, (FOL) of docs/trajectories.md, which is written twice: here for
 one robot that lives, and in rollouts.c for thousands that are simulated.
@@ -27,7 +27,7 @@ from cg_dynamics.rig import STANCES
 from cg_dynamics.settings import Settings, setting
 
 REMEDIES = ('clock', 'blank', 'event', 'phase')
-STILL = 1e-3  # at rest every phase is equally close: this much of trace(S) counts against that
+LEAST_TURN = 0.2  # of 1 - n_s'(x - x0), which is 0 where surfaces meet: there no phase is defined
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class TrackingSettings(Settings):
         minimum=0.0, maximum=1.0, live=True,
     )  # fmt: skip
     pull: float = setting(
-        5.0, 'phase: rate at which the phase is drawn to the closest point', unit='1/s',
-        minimum=0.0, maximum=100.0, live=True,
+        5.0, 'phase: rate at which the phase is drawn to the surface that holds the state',
+        unit='1/s', minimum=0.0, maximum=1000.0, live=True,
     )  # fmt: skip
     fastest: float = setting(
         2.0, 'phase: largest rate of the phase, and the inverse of the least', minimum=1.0,
@@ -177,26 +177,26 @@ class Tracker:
             if self._landing[node] >= 0:
                 node, self.elapsed = self._landing[node], 0.0
         else:
-            self.elapsed += self._rate(x) * elapsed
+            self.elapsed += self._rate(x, elapsed) * elapsed
         while self.elapsed >= self._span[node]:
             self.elapsed -= self._span[node]
             node = self._next[node]
         self.node = node
 
-    def _rate(self, x: np.ndarray) -> float:
-        """ds/dt that brings the reference nearer to the closest point: Newton's step, limited."""
+    def _rate(self, x: np.ndarray, elapsed: float) -> float:
+        """ds/dt that brings the reference to the surface on which the robot is, limited."""
         pull = self.settings.pulled
         if pull == 0.0:
             return 1.0
-        s, edge, nx = self.elapsed, self._edges[self.node], self._nx
-        tangent = np.array((0.0, 1.0, 2 * s, 3 * s * s)).dot(edge[:, 1 : 1 + nx])
-        deviation = x - np.array((1.0, s, s * s, s * s * s)).dot(edge[:, 1 : 1 + nx])
-        value, slope = self.nodes.costs[self.node]
-        S = value + s * slope
-        along = S.dot(tangent)
-        offset = along.dot(deviation) / (along.dot(tangent) + STILL * S.trace())
+        s, nx = self.elapsed, self._nx
+        powers = np.array((1.0, s, s * s, s * s * s))
+        deviation = x - powers.dot(self._edges[self.node][:, 1 : 1 + nx])
+        normal, turn = self.nodes.surfaces[self.node]
+        ahead = (normal + s * turn).dot(deviation).item()
+        ahead /= max(1.0 - turn.dot(deviation).item(), LEAST_TURN)
         fastest = self.settings.fastest
-        return min(max(1.0 + pull * offset.item(), 1 / fastest), fastest)
+        # By now the robot should be ahead of where the reference was by as much time as is over.
+        return min(max(1.0 + pull * (ahead - elapsed), 1 / fastest), fastest)
 
     def _blanked(self) -> bool:
         if self.settings.remedy != 'blank':

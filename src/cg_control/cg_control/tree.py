@@ -1,4 +1,4 @@
-"""A grown tree and its file: nodes, the goal regions where the balance controller takes over.
+"""A tree and its file: nodes, the goal regions where the balance controller takes over.
 
 A file is an archive (archive.py) of plain arrays, one a field of `Nodes`, and a header with
 format, model hash and provenance. Every index and number is looked at before it is used.
@@ -17,7 +17,7 @@ from cg_control.trajectory import TrajectoryError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 
-FORMAT = 'cg_tree/2'
+FORMAT = 'cg_tree/3'
 LARGEST_FILE = 1 << 30  # bytes, unpacked
 MOST_NODES = 1_000_000
 MEMBERS = (*ARRAYS, 'goal', 'champions')
@@ -30,7 +30,7 @@ class TreeError(TrajectoryError):
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree of trajectories, and where they end.
+    """A tree of trajectories, and where they end: upright, or on an orbit of the nodes.
 
     Attributes:
         nodes: The trajectories.
@@ -122,13 +122,13 @@ class Tree:
             nodes.require_consistency()
         except TrajectoryError as error:
             raise TreeError(str(error)) from None
-        _require_goal(arrays['goal'])
+        astray = nodes.orbiting & (nodes.branch > 0)
+        if astray.any():
+            raise TreeError(f'node {np.argmax(astray)} leads round and round, and never home')
+        _require_goal(arrays['goal'], nodes)
         homes = nodes.stance[nodes.planned < 0]
         if np.isnan(arrays['goal'][homes]).any():
             raise TreeError('a root stands on a leg that is no goal')
-        if np.isnan(nodes.to_go).any():
-            node = int(np.flatnonzero(np.isnan(nodes.to_go))[0])
-            raise TreeError(f'node {node} leads round and round, and never home')
         _require_champions(arrays['champions'], nodes)
         return cls(
             nodes, arrays['goal'], header.get('provenance') or {}, arrays['champions']
@@ -146,15 +146,15 @@ def _require_kinds(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) 
             raise TreeError(f'{name} holds {arrays[name].dtype}, expected kind {allowed!r}')
 
 
-def _require_goal(goal: np.ndarray) -> None:
+def _require_goal(goal: np.ndarray, nodes: Nodes) -> None:
     """Refuse goal regions that are none."""
     for form in goal:
         if np.isnan(form).all():
             continue
         if not np.isfinite(form).all() or np.linalg.eigvalsh((form + form.T) / 2).min() <= 0:
             raise TreeError('goal must be positive definite on a leg, or NaN')
-    if np.isnan(goal).all():
-        raise TreeError('goal must be positive definite on one leg at least')
+    if np.isnan(goal).all() and not nodes.orbiting.any():
+        raise TreeError('goal must be positive definite on one leg at least, without an orbit')
 
 
 def _require_champions(champions: np.ndarray, nodes: Nodes) -> None:

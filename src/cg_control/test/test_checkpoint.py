@@ -114,7 +114,7 @@ def test_a_tree_is_no_checkpoint_and_a_checkpoint_no_tree(robot, stages, file, t
     stages[0].tree.save(tmp_path / 'tree.npz')
     with pytest.raises(TreeError, match='not a tree that grows: home, failed is missing'):
         Checkpoint.load(tmp_path / 'tree.npz', robot)
-    with pytest.raises(TreeError, match="not a tree: format must be 'cg_tree/2'"):
+    with pytest.raises(TreeError, match="not a tree: format must be 'cg_tree/3'"):
         Tree.load(file)
 
 

@@ -67,10 +67,13 @@ def test_time_and_steps_to_go_add_up(tree, step, back):
     assert len(seen) == len(step.time) + len(back.time) + 1
 
 
-def test_a_way_that_leads_round_has_no_time_to_go(tree):
+def test_a_way_that_leads_round_is_an_orbit(tree):
     landing = tree.landing.copy()
     landing[tree.impact] = tree.first, tree.first
-    assert np.isnan(replace(tree, landing=landing).to_go[tree.first])
+    round_ = replace(tree, landing=landing)
+    assert round_.orbiting[tree.first]
+    assert round_.to_go[tree.first] == 0.0
+    assert not round_.orbiting[round_.late].any()
 
 
 def test_at_and_beyond_an_impact_nothing_is_claimed(tree, step):
