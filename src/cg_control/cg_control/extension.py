@@ -192,14 +192,22 @@ def first_of(order: Sequence[Attempt], model: Model, options: ExtensionOptions) 
         if isinstance(attempt.task.goal, Stretch):
             how = dataclasses.replace(how, starts=(SOON,))
         with contextlib.suppress(PlanningError, TrajectoryError):
-            return _branch(optimise(model, attempt.task, how, options.friction), attempt,
-                           model, options)  # fmt: skip
+            motion = optimise(model, attempt.task, how, options.friction)
+            return branch_of(motion, attempt, model, options)
     return None
 
 
-def _branch(
+def branch_of(
     motion: Trajectory, attempt: Attempt, model: Model, options: ExtensionOptions
 ) -> Branch:
+    """A motion with the gains and the funnels that end in those of the tree.
+
+    Args:
+        motion: Found for the attempt.
+        attempt: What it was found for.
+        model: The robot.
+        options: The weights are theirs.
+    """
     onto = int(motion.provenance.get('onto', attempt.node[0]))
     elapsed = float(motion.provenance.get('elapsed', 0.0))
     S, F = attempt.end(onto, elapsed)

@@ -278,7 +278,8 @@ class Grower:
         rows, nodes, costs = (np.concatenate(parts) for parts in zip(*came_by, strict=True))
         self.levels.add(nodes, costs, home[rows])
         touched = np.unique(nodes)
-        touched = touched[~self.nodes.late[touched]]
+        # The tube of an orbit is known.
+        touched = touched[~self.nodes.late[touched] & ~self.nodes.orbiting[touched]]
         self.nodes.rho[touched] = self.levels.rho(touched)
         self._lookup.refresh()
         return home

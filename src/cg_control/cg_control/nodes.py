@@ -13,6 +13,7 @@ does while an impact is late are nodes too, but no state is claimed by them.
                   landing: x3 ----> x4 -link-> root, rests          on the other leg
 """
 
+import enum
 import functools
 import math
 from collections.abc import Sequence
@@ -33,6 +34,14 @@ LATE = 0.3  # s for which the reference goes on while an impact is late
 LATE_KNOT = 0.01  # s between its knots
 FALLING = 1.0  # rad at which it ends
 SLOWEST = 0.05  # rad/s across a surface: more slowly it says nothing about the phase
+
+
+class Way(enum.IntEnum):
+    """Where the plan leads from a node."""
+
+    UPRIGHT = 0
+    TO_ORBIT = 1
+    ORBIT = 2  # the node is on it
 
 
 @dataclass(frozen=True)
@@ -171,7 +180,10 @@ class Nodes:
             first.stance, first.gains[0], first.cost_to_go[0], trajectory.model_hash,
             trajectory.provenance.get('friction') == 'to be compensated',
         )  # fmt: skip
-        return _concatenated(_chained(trajectory, model, frame, 0, 0, 0, tubes, late))
+        nodes = _concatenated(_chained(trajectory, model, frame, 0, 0, 0, tubes, late))
+        if tubes is not None:
+            nodes.rho[np.isinf(nodes.rho)] = 1.0
+        return nodes
 
     def __len__(self) -> int:
         return len(self.stance)
@@ -368,6 +380,19 @@ class Nodes:
                 number[node], node = count, self.planned[node]
             count += 1
         return number[self._end]
+
+    @functools.cached_property
+    def root_of(self) -> np.ndarray:
+        """The root of each stance leg, -1 for none, shape (2,)."""
+        roots = np.flatnonzero(self.planned < 0)
+        found = np.full(len(STANCES), -1)
+        found[self.stance[roots]] = roots
+        return found
+
+    @functools.cached_property
+    def ways(self) -> np.ndarray:
+        """A `Way` of each node, shape (n,)."""
+        return np.where(self.orbiting, Way.ORBIT, np.where(self.orbit_of >= 0, Way.TO_ORBIT, 0))
 
     @functools.cached_property
     def to_go(self) -> np.ndarray:

@@ -1,9 +1,13 @@
-"""Following a tree live: recovery from wherever a funnel holds the robot, then balance.
+"""Following a tree live: recovery from wherever it brings the robot home, then balance or walking.
 
 At every measurement, in this order:
 
-    1. In the goal region of the leg that stands the robot balances. It leaves the basin of
-       the balance controller for a funnel that holds it, or when it is far out.         (HOME)
+    0. Where a branch leads from the home that the robot is at towards the one that is wanted, it
+       takes that: upright when the balance controller holds it there, from an orbit when it comes
+       by, inside the tube. Wanted is what the speed says.                             (DEPART)
+    1. On a way to upright, in the goal region of the leg that stands, the robot balances. It
+       leaves the basin of the balance controller for a funnel that holds it, or when it is far
+       out.                                                                              (HOME)
     2. It follows its node as long as the funnel there holds it. It goes over to the node at
        which its state is least deep, if it has left its funnel, or if it is so much less deep
        there and home is not further.                                                    (SWITCH)
@@ -31,7 +35,9 @@ import numpy as np
 
 from cg_control.balance import BALANCING, IDLE, BalanceController, BalanceSettings, Command
 from cg_control.lookup import Claim, Lookup
+from cg_control.nodes import Way
 from cg_control.preview import LANDING, Preview
+from cg_control.routes import UPRIGHT, Routes
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
 from cg_dynamics.model import Model
@@ -40,6 +46,7 @@ from cg_dynamics.settings import setting
 
 FOLLOWING, OUTSIDE = 'following', 'outside'
 KEPT = 5000  # look-ups whose time is remembered
+CALM = 0.1  # depth in the goal region up to which a robot that stands begins to walk
 STAY, NOWHERE = -1, -2  # in place of a node to go over to
 
 
@@ -87,6 +94,15 @@ class RecoverySettings(BalanceSettings):
         0.01, 'for how long a preview counts', unit='s', minimum=0.001, maximum=1.0, live=True
     )
 
+    speed: float = setting(
+        0.0, 'at which the robot is to walk; it takes the orbit that is nearest, 0 is to stand',
+        unit='m/s', minimum=0.0, maximum=2.0, live=True,
+    )  # fmt: skip
+    steps: int = setting(
+        0, 'after which the robot is to stand; 0: it walks on', minimum=0, maximum=1_000_000,
+        live=True,
+    )  # fmt: skip
+
     @property
     def tracking(self) -> TrackingSettings:
         """Those of the law that follows."""
@@ -102,12 +118,14 @@ class ReadyTree:
         lookup: Of its funnels.
         tracker: Of its nodes.
         preview: Of its entries, on the robot as it is known.
+        routes: From home to home.
     """
 
     tree: Tree
     lookup: Lookup
     tracker: Tracker
     preview: Preview
+    routes: Routes
 
     @classmethod
     def of(cls, tree: Tree, model: Model) -> 'ReadyTree':
@@ -122,9 +140,10 @@ class ReadyTree:
         """
         nodes = tree.nodes
         preview = Preview(tree, model)
-        ready = cls(tree, Lookup(nodes), Tracker(nodes, model), preview)
+        routes = Routes.of(nodes, tree.speeds)
+        ready = cls(tree, Lookup(nodes), Tracker(nodes, model), preview, routes)
         # What is worked out once, when it is first asked for; the rollouts are compiled.
-        _ = nodes.costs, nodes.to_go, nodes.steps
+        _ = nodes.costs, nodes.surfaces, nodes.to_go, nodes.steps, nodes.ways
         try:
             preview.choose(nodes.stance[:1], nodes.x0[:1])
         except ValueError as error:
@@ -145,6 +164,7 @@ class TreeController:
         entered: Node at which it went over to where it is now, -1 while none is followed.
         depth: Of the last state: in the basin while balancing, in the funnel otherwise, NaN
             where none is said (an impact is due). Inside if 1 or less.
+        steps_taken: Impacts since it was told at which speed to walk.
         switches: How often the robot has gone over to another node while it followed one.
         lookup_times: Of the last look-ups, s.
         preview_times: Of the last previews, s.
@@ -153,7 +173,7 @@ class TreeController:
     def __init__(self, balance: BalanceController, settings: RecoverySettings):
         self.balance, self.settings = balance, settings
         self.mode, self.node, self.entered = IDLE, -1, -1
-        self.depth, self.switches = math.inf, 0
+        self.depth, self.switches, self.steps_taken = math.inf, 0, 0
         self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._ready: ReadyTree | None = None
         self.preview_times: collections.deque[float] = collections.deque(maxlen=KEPT)
@@ -172,6 +192,21 @@ class TreeController:
         return self.balance.torque_limit
 
     @property
+    def wanted(self) -> int:
+        """The home that is wanted: an orbit of the tree, or routes.UPRIGHT."""
+        made = self.settings.steps and self.steps_taken >= self.settings.steps
+        if made or self._ready is None:
+            return UPRIGHT
+        return self._ready.routes.home_at(self.settings.speed)
+
+    @property
+    def way(self) -> Way:
+        """Where the node leads that is followed; upright while none is."""
+        if self.mode != FOLLOWING or self._ready is None:
+            return Way.UPRIGHT
+        return Way(self._ready.tree.nodes.ways[self._ready.tracker.node])
+
+    @property
     def to_go(self) -> float:
         """Nominal time until upright in s: 0 while balancing, infinite outside every funnel."""
         if self.mode != FOLLOWING or self._ready is None:
@@ -186,6 +221,8 @@ class TreeController:
 
     def adopt(self, settings: RecoverySettings) -> None:
         """New settings from the next step on."""
+        if (settings.speed, settings.steps) != (self.settings.speed, self.settings.steps):
+            self.steps_taken = 0
         self.settings = settings
         if self._ready is not None:
             self.take(self._ready)
@@ -221,7 +258,9 @@ class TreeController:
         if reason:
             self._rest(OUTSIDE)
             return Command(0.0, OUTSIDE, reason)
+        self.steps_taken += landed and self.mode == FOLLOWING
         best = self._best(stance, x)
+        self._depart(stamp_ns, stance, x)
         command = self._balanced(stamp_ns, stance, x, landed, best)
         return command or self._followed(stamp_ns, stance, x, best)
 
@@ -242,10 +281,47 @@ class TreeController:
             return f'leaning by {lean:.3g} rad, swing leg at {swing:.3g} rad'
         return ''
 
+    def _depart(self, stamp_ns: int, stance: str, x: np.ndarray) -> None:
+        """Begin a way towards the wanted home, if one leaves the present one here: (DEPART)."""
+        assert self._ready is not None
+        ready, nodes = self._ready, self._ready.tree.nodes
+        tracker, leg = ready.tracker, STANCES.index(stance)
+        if self.mode == BALANCING:
+            home, here, elapsed = UPRIGHT, int(nodes.root_of[leg]), 0.0
+        elif self.way == Way.ORBIT and nodes.stance[tracker.node] == leg:
+            here, elapsed = tracker.node, tracker.elapsed
+            home = int(nodes.orbit_of[here])
+        else:
+            return
+        if home == self.wanted:
+            return
+        entry = ready.routes.towards(home, self.wanted).get(here)
+        if entry is None or not self._ready_to_leave(stamp_ns, stance, x, entry):
+            return
+        if self.mode == BALANCING:
+            self.balance.stop()
+        self.mode, self.entered = FOLLOWING, entry
+        tracker.begin(entry, elapsed)
+
+    def _ready_to_leave(self, stamp_ns: int, stance: str, x: np.ndarray, entry: int) -> bool:
+        """Whether the robot is calm enough to take a way to another home."""
+        assert self._ready is not None
+        if self.mode != BALANCING:
+            return self._depth_here(stance, x) <= 1.0
+        if self._depth_in_goal(stance, x) > CALM:
+            return False
+        since = None if self._previewed_ns is None else (stamp_ns - self._previewed_ns) * 1e-9
+        if since is not None and 0.0 <= since < self.settings.preview_period:
+            return False
+        self._previewed_ns = stamp_ns
+        return bool(self._ready.preview.brings_home(np.array([entry]), x[None])[0])
+
     def _balanced(
         self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool, best: Claim
     ) -> Command | None:
         """The balance controller's answer, where (HOME) gives it the robot."""
+        if self.way != Way.UPRIGHT:
+            return None
         if self.mode == BALANCING and not landed:
             depth = self._depth_in_basin(stance, x)
             at_home = depth <= (1.0 if best.depth <= 1.0 else self.settings.hold)

@@ -22,12 +22,13 @@
 #define CONVERGED 1e-13 /* s; the next step of Newton's method would be rounding */
 
 enum { RUNNING, ARRIVED, FALLEN, LEFT, TIMED_OUT };
+enum { UPRIGHT, TO_ORBIT, ORBIT };
 
 struct job {
-    /* The tree: leg, next, landing, late, orbit, span (n), edge (n, 4, LAW), cost (n, 2, FORM),
+    /* The tree: leg, next, landing, late, way, span (n), edge (n, 4, LAW), cost (n, 2, FORM),
        normal (n, 2, NL); what the controller knows, (NK). */
     const int *leg, *next, *landing;
-    const unsigned char *late, *orbit;
+    const unsigned char *late, *way;
     const double *span, *edge, *cost, *normal, *known;
     /* Goal forms (2, FORM) or null; parameters (NP), or (B, NP) if p_each. */
     const double *goal, *p;
@@ -64,7 +65,7 @@ struct lanes {
     vd x[NX], u[NU], h, elapsed, left, tick, samples, span, edge[4][LAW], form[2][FORM];
     vd normal[2][NL];
     vd c[CONSTANTS], landing[CONSTANTS], length;
-    vi orbit;           /* on an orbit, whose tube is a goal */
+    vi upright, orbit;  /* leads upright; is on an orbit, whose tube is a goal */
     vi busy, strange;   /* strange: at the start, or on a leg that is not the node's */
     long number[WIDTH]; /* -1: idle */
     struct walk *walk[WIDTH];
@@ -107,8 +108,9 @@ static void enter(const struct job *job, struct lanes *l, int j)
     if (job->pull > 0)
         for (int k = 0; k < 2; k++)
             for (int i = 0; i < NL; i++) l->normal[k][i][j] = normal[k * NL + i];
-    l->orbit[j] = job->goal && job->orbit[node] ? -1 : 0;
-    if (l->orbit[j])
+    l->upright[j] = job->way[node] == UPRIGHT ? -1 : 0;
+    l->orbit[j] = job->way[node] == ORBIT ? -1 : 0;
+    if (job->goal && l->orbit[j])
         for (int k = 0; k < 2; k++)
             for (int i = 0; i < FORM; i++) l->form[k][i][j] = cost[k * FORM + i];
 }
@@ -362,7 +364,7 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
                 vd away = SPLAT(0.0);
                 for (int i = 0, k = 0; i < NL; i++)
                     for (int j = i; j < NL; j++, k++) away += goal[k] * l.x[i] * l.x[j];
-                arrived = asks & (away <= 1.0);
+                arrived = asks & l.upright & (away <= 1.0);
                 /* On the leg of its node: another one has not moved the reference yet. */
                 vi orbit = asks & l.orbit & ~l.strange;
                 if (any(orbit)) arrived |= orbit & in_tube(&l);

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from cg_control.friction import friction_parameters, friction_torque
-from cg_control.nodes import Nodes, triangles
+from cg_control.nodes import Nodes, Way, triangles
 from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
 from cg_dynamics.batch import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
@@ -41,7 +41,7 @@ SAMPLE_TIME = 0.002  # s
 LENGTH = 'leg_length'
 # Of struct job in rollouts.c, in its order.
 FIELDS: dict[Any, tuple[str, ...]] = {
-    ctypes.c_void_p: ('leg', 'next', 'landing', 'late', 'orbit', 'span', 'edge', 'cost',
+    ctypes.c_void_p: ('leg', 'next', 'landing', 'late', 'way', 'span', 'edge', 'cost',
                       'normal', 'known', 'goal', 'p', 'x', 'elapsed', 'node', 'stance', 'samples',
                       'clock', 'outcome', 'impacts', 'time', 'visited', 'visit_cost',
                       'visit_state'),
@@ -129,8 +129,8 @@ def follow(
         x: State of each, shape (B, 4); or (B, nx) with the states of effects.
         duration: Time for all or for each in s, in whole samples (rounded up), () or (B,).
         goal: Goal region x' F x <= 1 of each stance leg, shape (2, 4, 4), NaN on a leg without;
-            a robot that is inside at a sample has arrived, and so has one that follows an orbit
-            and is in its tube. None: nobody arrives.
+            a robot on its way there that is inside at a sample has arrived, and so has one that
+            follows an orbit and is in its tube. None: nobody arrives.
         elapsed: Time since the start node at the start in s, shape (B,); None: zero.
         known: The robot as the controller knows it; None: as it is.
         p: Parameter vectors in place of those of `robot`, shape (np,) or (B, np).
@@ -205,11 +205,12 @@ class _Work:
         arrays = {
             'leg': _whole(nodes.stance), 'next': _whole(nodes.next),
             'landing': _whole(nodes.landing), 'late': np.ascontiguousarray(nodes.late),
-            'orbit': np.ascontiguousarray(nodes.orbiting),
+            'way': np.ascontiguousarray(nodes.ways, np.uint8),
             'span': np.ascontiguousarray(nodes.span), 'edge': nodes.edges,
             'cost': nodes.forms, 'normal': np.ascontiguousarray(nodes.surfaces),
             'known': friction_parameters(known), 'goal': forms, 'p': self.p, 'x': self.x,
-            'elapsed': self.elapsed, 'node': self.node, 'stance': self.stance, 'samples': self.samples,
+            'elapsed': self.elapsed, 'node': self.node, 'stance': self.stance,
+            'samples': self.samples,
             'clock': _whole([name in CLOCKS for name in compiled.input_names]),
             'outcome': self.outcome, 'impacts': self.impacts, 'time': self.time,
             'visited': self.visited, 'visit_cost': self.visit_cost,
@@ -281,19 +282,23 @@ class _Work:
     def _outcome(self, b: int, leg: int, x, tick: int, tracker: Tracker, how) -> int:
         """An `Outcome`, or zero while the rollout goes on."""
         motion = x[: self.nodes.x0.shape[1]]
-        node, elapsed = tracker.node, tracker.elapsed
-        if self.goal is not None and motion @ self.goal[leg] @ motion <= 1.0:
+        node = tracker.node
+        if self.goal is not None and self._arrived(leg, motion, tracker):
             return Outcome.ARRIVED
-        on_orbit = self.nodes.orbiting[node] and self.nodes.stance[node] == leg
-        if self.goal is not None and on_orbit:
-            if self.nodes.cost_to_go(node, elapsed, motion) <= 1.0:
-                return Outcome.ARRIVED
         swings = self.hybrid and not abs(x[1 - leg]) < how.swing_angle
         if swings or not abs(x[leg]) < how.fall_angle:
             return Outcome.FALLEN
         if self.nodes.stance[node] != leg and self.nodes.landing[node] < 0:
             return Outcome.LEFT
         return Outcome.TIMED_OUT if tick >= self.samples[b] else 0
+
+
+    def _arrived(self, leg: int, motion: np.ndarray, tracker: Tracker) -> bool:
+        node, way = tracker.node, self.nodes.ways[tracker.node]
+        if way == Way.UPRIGHT:
+            return bool(motion @ self.goal[leg] @ motion <= 1.0)
+        on_orbit = way == Way.ORBIT and self.nodes.stance[node] == leg
+        return on_orbit and self.nodes.cost_to_go(node, tracker.elapsed, motion) <= 1.0
 
 
 # (leg, x, torque in N m, instant in s) -> leg and x a sample later.

@@ -20,7 +20,7 @@ from cg_dynamics.rig import STANCES
 FORMAT = 'cg_tree/3'
 LARGEST_FILE = 1 << 30  # bytes, unpacked
 MOST_NODES = 1_000_000
-MEMBERS = (*ARRAYS, 'goal', 'champions')
+MEMBERS = (*ARRAYS, 'goal', 'champions', 'speeds')
 INTEGERS = ('stance', 'next', 'landing', 'branch')
 
 
@@ -39,12 +39,14 @@ class Tree:
         provenance: How it was grown. JSON values.
         champions: Entries that a preview tries whatever the state, of each stance leg, those that
             bring most states home first; -1 where there are no more: shape (2, m).
+        speeds: Of its orbits in m/s, in the order of `Nodes.orbit_of`, shape (orbits,).
     """
 
     nodes: Nodes
     goal: np.ndarray
     provenance: Mapping[str, Any] = field(default_factory=dict)
     champions: np.ndarray = field(default_factory=lambda: np.zeros((len(STANCES), 0), np.int32))
+    speeds: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def legs(self) -> tuple[str, ...]:
@@ -77,8 +79,8 @@ class Tree:
         }
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the nodes, the goal and the champions, by name."""
-        own = {'goal': self.goal, 'champions': self.champions}
+        """The arrays of the nodes and its own, by name."""
+        own = {'goal': self.goal, 'champions': self.champions, 'speeds': self.speeds}
         return {name: getattr(self.nodes, name) for name in ARRAYS} | own
 
     @classmethod
@@ -130,9 +132,13 @@ class Tree:
         if np.isnan(arrays['goal'][homes]).any():
             raise TreeError('a root stands on a leg that is no goal')
         _require_champions(arrays['champions'], nodes)
+        orbits = int(nodes.orbit_of.max()) + 1
+        if arrays['speeds'].shape != (orbits,) or not np.isfinite(arrays['speeds']).all():
+            raise TreeError(f'speeds must be {orbits} finite numbers, one for each orbit')
         return cls(
-            nodes, arrays['goal'], header.get('provenance') or {}, arrays['champions']
-        )
+            nodes, arrays['goal'], header.get('provenance') or {}, arrays['champions'],
+            arrays['speeds'],
+        )  # fmt: skip
 
 
 def _require_kinds(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
