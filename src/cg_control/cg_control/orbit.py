@@ -8,7 +8,6 @@ motion of the exact hybrid model (`closing.py`).
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,12 +96,12 @@ class Orbit:
 
     @property
     def cost_of_transport(self) -> float:
-        """int |P| dt / (m g d): P power of the motor, with the friction it gives back; d way."""
+        """Mechanical: int |P| dt / (m g d), P the power of the motor, d the way."""
         return self._transport(np.abs)
 
     @property
     def positive_cost_of_transport(self) -> float:
-        """int max(P, 0) dt / (m g d): as if braking cost nothing."""
+        """As if braking cost nothing: int max(P, 0) dt / (m g d)."""
         return self._transport(lambda power: np.maximum(power, 0.0))
 
     def _transport(self, counted) -> float:
@@ -127,13 +126,14 @@ class Orbit:
 
     @property
     def friction_needed(self) -> float:
-        """Friction of the ground without which a foot slides, in stance or at an impact."""
-        ground = Ground(self.slope)
-        stance = max(float(np.abs(f[:, 0] / f[:, 1]).max()) for f in self.ground_forces)
-        return max(
-            stance,
-            *(abs(i.impulse @ ground.tangent / (i.impulse @ ground.normal)) for i in self.impacts),
-        )
+        """Friction of the ground without which the stance foot slides."""
+        return max(float(np.abs(f[:, 0] / f[:, 1]).max()) for f in self.ground_forces)
+
+    @property
+    def impact_friction_needed(self) -> float:
+        """Friction of the ground without which a foot slides as it lands."""
+        ground, impulses = Ground(self.slope), [struck.impulse for struck in self.impacts]
+        return max(float(abs(P @ ground.tangent / (P @ ground.normal))) for P in impulses)
 
     @property
     def foot_depth(self) -> float:
