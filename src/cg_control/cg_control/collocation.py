@@ -236,7 +236,11 @@ def screen(
 
 
 def optimise(
-    model: Model, task: Task, options: Options | None = None, friction: bool = True
+    model: Model,
+    task: Task,
+    options: Options | None = None,
+    friction: bool = True,
+    near: Trajectory | None = None,
 ) -> Trajectory:
     """The cheapest motion found for a task, without feedback.
 
@@ -245,6 +249,8 @@ def optimise(
         task: What is asked.
         options: How to solve.
         friction: Whether joint friction is part of the plan.
+        near: A motion of a similar task: the fine solve starts there, and where that converges
+            there is no search.
 
     Raises:
         InfeasibleError: no motion near any guess.
@@ -253,40 +259,16 @@ def optimise(
     options = options or Options()
     returned = given_back(model, task, friction)
     planned = planning_model(model, friction or bool(returned))
-    soft, exact = softened(planned), softened(planned, returned)
-    coarse = screen(soft, task, options, returned)
-    what = f'{" -> ".join(task.modes)} from {_said(task.start)} to {_said(task.goal)}'
-    if coarse.verdict == 'infeasible':
-        limit = planned.torque_limit if task.torque_limit is None else task.torque_limit
-        raise InfeasibleError(
-            f'no motion {what} within {limit:g} N m: the nearest misses goal or landing '
-            f'by {coarse.miss:.2g} (1 is 0.1 rad or 0.3 rad/s)',
-            coarse.iterations,
-        )
-    if coarse.best is None:
-        raise UndecidedError(
-            f'no motion {what} found within {len(options.starts)} guesses of '
-            f'{options.coarse_iterations} iterations or {options.iterations} in all; '
-            'there may be one',
-            coarse.iterations,
-        )
     # Of what is given back only the limit knows, and there a wider band does no harm.
-    fine = Program(exact, task, options.fine, False, returned)
-    spent, found = coarse.iterations, coarse.best
-    guesses = map(fine.guess, options.starts[: options.guesses])
-    starts = [coarse.best.resampled(options.fine), *guesses]
-    same = options.coarse == options.fine and soft.values == exact.values
-    for start in [] if same else starts:
+    fine = Program(softened(planned, returned), task, options.fine, False, returned)
+    found, spent = None, 0
+    if near is not None:
+        start = Solution.of(near).resampled(options.fine)
         found = fine.solve(start, options.fine_iterations, options.tolerance)
-        spent += found.iterations
-        if found.converged or spent >= options.iterations:
-            break
-    if not found.converged:
-        raise UndecidedError(
-            f'a coarse motion {what} exists, but {options.fine} intervals a phase do not '
-            f'converge within {options.fine_iterations} iterations',
-            spent,
-        )
+        spent = found.iterations
+    if found is None or not found.converged:
+        found, more = _searched(softened(planned), fine, options, returned)
+        spent += more
     joined: dict[str, Any] = {}
     if isinstance(task.goal, Stretch):
         joined = dict(zip(('onto', 'elapsed'), task.goal.place(found.slid), strict=True))
@@ -306,6 +288,45 @@ def optimise(
     if not (friction and returned):
         return motion
     return motion.with_phases(tuple(_with_friction(p, planned, fine.limit) for p in motion.phases))
+
+
+def _searched(
+    soft: Model, fine: Program, options: Options, returned: tuple[str, ...]
+) -> tuple[Solution, int]:
+    """Coarse, then fine: the solution, and the iterations spent."""
+    task = fine.task
+    coarse = screen(soft, task, options, returned)
+    what = f'{" -> ".join(task.modes)} from {_said(task.start)} to {_said(task.goal)}'
+    if coarse.verdict == 'infeasible':
+        limit = soft.torque_limit if task.torque_limit is None else task.torque_limit
+        raise InfeasibleError(
+            f'no motion {what} within {limit:g} N m: the nearest misses goal or landing '
+            f'by {coarse.miss:.2g} (1 is 0.1 rad or 0.3 rad/s)',
+            coarse.iterations,
+        )
+    if coarse.best is None:
+        raise UndecidedError(
+            f'no motion {what} found within {len(options.starts)} guesses of '
+            f'{options.coarse_iterations} iterations or {options.iterations} in all; '
+            'there may be one',
+            coarse.iterations,
+        )
+    spent, found = coarse.iterations, coarse.best
+    guesses = map(fine.guess, options.starts[: options.guesses])
+    starts = [coarse.best.resampled(options.fine), *guesses]
+    same = options.coarse == options.fine and soft.values == fine.model.values
+    for start in [] if same else starts:
+        found = fine.solve(start, options.fine_iterations, options.tolerance)
+        spent += found.iterations
+        if found.converged or spent >= options.iterations:
+            break
+    if not found.converged:
+        raise UndecidedError(
+            f'a coarse motion {what} exists, but {options.fine} intervals a phase do not '
+            f'converge within {options.fine_iterations} iterations',
+            spent,
+        )
+    return found, spent
 
 
 def _with_friction(phase: Phase, model: Model, limit: float) -> Phase:

@@ -31,6 +31,7 @@ LARGEST_ANGLE, LARGEST_RATE = 1.5, 30.0  # rad, rad/s: bounds of every state
 SMALLEST_LIMIT = 0.01  # N m
 WEAK = 1e-4  # weight of the running cost in the elastic program
 BALLISTIC = 0.2  # s
+FAR_AWAY = 1e3  # m
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,16 @@ class Solution:
     seconds: float
     slid: float = 0.0
 
+    @classmethod
+    def of(cls, motion: Trajectory) -> 'Solution':
+        """A motion as a place to start from."""
+        knots = tuple(
+            np.column_stack([phase.states, phase.rates[:, 2:], phase.torque])
+            for phase in motion.phases
+        )
+        durations = tuple(phase.end - phase.start for phase in motion.phases)
+        return cls(False, math.inf, math.inf, knots, durations, 0, 0.0)
+
     def trajectory(self, modes: Sequence[str], model_hash: str, **provenance: Any) -> Trajectory:
         """The motion as a trajectory that begins at time zero."""
         phases, start = [], 0.0
@@ -104,7 +115,7 @@ class Program:
         elastic: bool = False,
         given_back: tuple[str, ...] = (),
     ):
-        self.task, self.intervals = task, intervals
+        self.model, self.task, self.intervals = model, task, intervals
         structure = task.structure(intervals, elastic, given_back)
         self.transcription: Transcription = transcribe(model, structure)
         limit = model.torque_limit if task.torque_limit is None else task.torque_limit
@@ -121,6 +132,7 @@ class Program:
                 task.retraction if math.isfinite(task.retraction) else 0.0,
                 task.reach,
                 task.approach,
+                min(task.farthest, FAR_AWAY),
             ],
             _goal_parameters(task, weak),
         ])  # fmt: skip
@@ -132,6 +144,10 @@ class Program:
         if 'motor' in t.rows_of:
             limit = self.limit / TORQUE_SCALE
             self.lower[t.rows_of['motor']], self.upper[t.rows_of['motor']] = -limit, limit
+        if 'reach' in t.rows_of:
+            self.upper[t.rows_of['reach']] = task.farthest - task.reach
+        if task.total is not None:
+            self.lower[t.rows_of['total']], self.upper[t.rows_of['total']] = task.total
         self.x_lower, self.x_upper = self._bounds(elastic)
 
     def _columns(self) -> Iterator[tuple[int, int, int, int]]:
@@ -216,12 +232,14 @@ class Program:
 
     def _packed(self, start: Solution) -> np.ndarray:
         z = np.zeros(self.transcription.size)
-        memory = self.transcription.memory
+        first = (start.knots[0][0][:4] / MEMORY_UNITS)[: self.transcription.memory]
         for i, k, at, size in self._columns():
             nx = self.transcription.nx
             z[at : at + KNOT] = start.knots[i][k] / UNITS
             z[at + 7] = start.durations[i]
-            z[at + 8 : at + 8 + memory] = (start.knots[0][0][:4] / MEMORY_UNITS)[:memory]
+            z[at + 8 : at + 8 + len(first)] = first
+            if self.task.total is not None:
+                z[at + nx - 1] = sum(start.durations[:i])
             if k < self.intervals:
                 z[at + nx : at + size] = start.knots[i][k + 1] / UNITS
             elif i < len(self.task.modes) - 1:
@@ -235,7 +253,8 @@ class Program:
         """Solve from a start on the same grid."""
         began = time.perf_counter()
         points = (self.x_lower == self.x_upper).tobytes()
-        solver = self.transcription.solver(iterations, tolerance, points)
+        equality = self.lower == self.upper
+        solver = self.transcription.solver(iterations, tolerance, equality, points)
         try:
             result = solver(
                 x0=self._packed(start), lbx=self.x_lower, ubx=self.x_upper,

@@ -184,12 +184,14 @@ class Task:
         torque_limit: In N m; None takes the model's.
         rate_limit: Of the torque, N m/s.
         durations: Shortest and longest phase, s.
+        total: Shortest and longest motion as a whole, s; None: as long as its phases may be.
         effort: Weight of u^2, 1/((N m)^2 s).
         time: Weight of the duration, 1/s.
         slope: Fall of the ground ahead, rad.
         retraction: The swing foot may go this deep below the ground before it is ahead by 2 cm;
             infinite: it is not looked at, as on blocks. m.
-        reach: Least step length, m.
+        reach: Least step length, horizontally, m.
+        farthest: Greatest step length, horizontally, m.
         approach: Least rate at which the foot lands, m/s: the instant of a grazing impact is
             not defined well.
     """
@@ -201,11 +203,13 @@ class Task:
     torque_limit: float | None = None
     rate_limit: float = math.inf
     durations: tuple[float, float] = (0.1, 2.0)
+    total: tuple[float, float] | None = None
     effort: float = 0.01
     time: float = 0.1
     slope: float = 0.0
     retraction: float = math.inf
     reach: float = 0.1
+    farthest: float = math.inf
     approach: float = 0.05
 
     def __post_init__(self):
@@ -225,6 +229,10 @@ class Task:
         low, high = self.durations
         if not 0 < low < high:
             raise ValueError(f'durations are {self.durations}; they must be positive, increasing')
+        if self.total is not None and not 0 < self.total[0] <= self.total[1]:
+            raise ValueError(f'total is {self.total}; it must be positive, not decreasing')
+        if not self.reach <= self.farthest:
+            raise ValueError(f'reach is {self.reach}, above farthest, {self.farthest}')
         if not self.rate_limit > 0 or not self.retraction >= 0:
             raise ValueError('rate_limit must be positive and retraction not negative')
 
@@ -238,6 +246,7 @@ class Task:
             periodic=self.periodic,
             rate_limited=math.isfinite(self.rate_limit),
             clearance=math.isfinite(self.retraction),
+            clocked=self.total is not None,
             goal=self._kind(),
             elastic=elastic,
             given_back=given_back,

@@ -52,7 +52,7 @@ MEMORY_UNITS = UNITS[:4]
 TORQUE_SCALE = 100.0  # N m; brings (ID) to the size of the other rows
 RATE_SCALE = 100.0  # N m/s
 CLEARANCE_WIDTH = 0.01  # m of reach over which a retracted foot comes down
-TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach')
+TASK_PARAMETERS = ('slope', 'effort', 'time', 'retraction', 'reach', 'approach', 'farthest')
 PIECES = 24  # of a stretch
 EDGE = 20  # numbers of a piece: 4 powers of 4 states and of the cost to go
 # Bounds; center and form; instants and edges of the pieces; the same and form.
@@ -75,6 +75,7 @@ class Structure:
             phases the legs then change places, which makes sense for two equal leg pairs.
         rate_limited: Rows for the rate of the torque.
         clearance: Rows that keep the swing foot above the ground, or its retraction below.
+        clocked: A row for the duration of the whole motion; stages carry what earlier phases took.
         goal: 'box', 'region' (an ellipsoid), 'stretch' (any point of a branch) or 'tube' (any
             point of an ellipsoid around one).
         elastic: Goal and landing are no conditions; the cost is how far they are missed. Such a
@@ -88,6 +89,7 @@ class Structure:
     periodic: bool = False
     rate_limited: bool = False
     clearance: bool = False
+    clocked: bool = False
     goal: str = 'box'
     elastic: bool = False
     given_back: tuple[str, ...] = ()
@@ -254,8 +256,9 @@ class Transcription:
             raise ValueError(f'motions are planned for a compass gait, not {model.mechanism.name}')
         self.structure = structure
         self.memory = 4 if structure.periodic else 0
-        self.nx = KNOT + 1 + self.memory
-        self.units = np.concatenate([UNITS, [1.0], MEMORY_UNITS[: self.memory]])
+        clock = [1.0] * structure.clocked
+        self.nx = KNOT + 1 + self.memory + len(clock)
+        self.units = np.concatenate([UNITS, [1.0], MEMORY_UNITS[: self.memory], clock])
         self.names_of_model = parameter_names(model, Setup())
         self.model_parameters = len(self.names_of_model)
         self.slides = structure.goal in ('stretch', 'tube')
@@ -363,7 +366,9 @@ class Transcription:
         ]
         rows += self._motor(s[:4], s[6])
         if self.memory:
-            rows.append(('memory', (s[8:] - s[:4]) / MEMORY_UNITS, 0.0, 0.0))
+            rows.append(('memory', (s[8:12] - s[:4]) / MEMORY_UNITS, 0.0, 0.0))
+        if self.structure.clocked:
+            rows.append(('memory', s[-1], 0.0, 0.0))
         return _block(f'start_{mode}', scaled, self._shared, rows, 0)
 
     def _landing(self, s: ca.SX, mode: str):
@@ -378,7 +383,9 @@ class Transcription:
         miss: Any = 0
         if self.structure.elastic:
             (_, height, *_), (_, approach, *_), (_, reach, *_) = rows
-            miss = height**2 + ca.fmin(approach, 0) ** 2 + 100 * ca.fmin(reach, 0) ** 2
+            beyond = ca.fmax(reach + task['reach'] - task['farthest'], 0)
+            near = ca.fmin(reach, 0) ** 2 + beyond**2
+            miss = height**2 + ca.fmin(approach, 0) ** 2 + 100 * near
             rows = []
         p = self._parameters_of(self._model)
         v_plus = impact_function(self._model, mode)(s[:2], s[2:4], p)[0]
@@ -397,9 +404,10 @@ class Transcription:
         rows.append(('dynamics', after, 0.0, 0.0))
         rows += self._motor(ca.vertcat(s[:2], v_plus), w[2])
         # The next state enters linearly; the rows of the gap come first and hold it back.
-        gap = ca.vertcat(
-            s[:2], v_plus / UNITS[2:4], scaled[self.nx :], scaled[8 : self.nx]
-        )
+        carried = scaled[8 : self.nx]
+        if self.structure.clocked:
+            carried[-1] += s[7]
+        gap = ca.vertcat(s[:2], v_plus / UNITS[2:4], scaled[self.nx :], carried)
         rows = [('', gap, 0.0, 0.0), *rows]
         return _block(f'jump_{mode}', scaled, self._shared, rows, miss)
 
@@ -415,9 +423,11 @@ class Transcription:
             swap = [1, 0] if len(self.structure.modes) % 2 else [0, 1]
             image = ca.vertcat(s[swap], v_plus[swap])
             if self.structure.elastic:
-                miss += ca.sumsqr((image - s[8:]) / MISS_SCALE)
+                miss += ca.sumsqr((image - s[8:12]) / MISS_SCALE)
             else:
-                rows.append(('periodicity', (image - s[8:]) / MEMORY_UNITS, 0.0, 0.0))
+                rows.append(('periodicity', (image - s[8:12]) / MEMORY_UNITS, 0.0, 0.0))
+        if self.structure.clocked:
+            rows.append(('total', s[-1] + s[7], np.nan, np.nan))
         goal = self.structure.goal
         if goal != 'box':
             center = self._goal[:4]
@@ -617,24 +627,26 @@ class Transcription:
             generator.add(function)
         return str(shared_library(generator.dump(), FLAGS_HERE, objects))
 
-    def solver(self, iterations: int, tolerance: float, points: bytes = b'') -> ca.Function:
+    def solver(
+        self, iterations: int, tolerance: float, equality: np.ndarray, points: bytes = b''
+    ) -> ca.Function:
         """Fatrop on the compiled program.
 
         Args:
             iterations: At most.
             tolerance: Of rows and optimality.
+            equality: Which rows have equal bounds, shape (ng,).
             points: Which variables have equal bounds. The interface takes note of them at the
                 first call and never again, so that each pattern needs a solver of its own.
         """
-        key = (iterations, tolerance, points)
+        key = (iterations, tolerance, equality.tobytes(), points)
         if key not in self._solvers:
-            equality = (self.lower == self.upper).tolist()
             self._solvers[key] = ca.nlpsol(
                 'cgt', 'fatrop', self._program,
                 {
                     'print_time': False, 'structure_detection': 'manual',
                     'N': len(self._nx) - 1, 'nx': self._nx, 'nu': self._nu, 'ng': self._ng,
-                    'equality': equality, 'error_on_fail': False,
+                    'equality': equality.tolist(), 'error_on_fail': False,
                     'fatrop': {
                         'print_level': 0, 'max_iter': iterations, 'tol': tolerance,
                     },
@@ -643,7 +655,7 @@ class Transcription:
         return self._solvers[key]
 
     @functools.cached_property
-    def _solvers(self) -> dict[tuple[int, float, bytes], ca.Function]:
+    def _solvers(self) -> dict[tuple[int, float, bytes, bytes], ca.Function]:
         return {}
 
 

@@ -288,19 +288,35 @@ def _impact_jacobian(function: ca.Function) -> ca.Function:
                        [ca.jacobian(v_plus, q), ca.jacobian(v_plus, v)])  # fmt: skip
 
 
-def jump_matrix(model: Model, before: Phase, after: Phase, slope: float = 0.0) -> np.ndarray:
-    """(SALT), shape (4, 4), at the impact between two phases."""
+def jump_matrix(
+    model: Model, before: Phase, after: Phase, slope: float = 0.0, restarts: bool = False
+) -> np.ndarray:
+    """(SALT), shape (4, 4), at the impact between two phases.
+
+    Args:
+        model: Of the impact.
+        before: The phase that ends.
+        after: The phase that begins.
+        slope: Of the ground, rad.
+        restarts: The clock of what follows starts at the impact, whenever that is: deviations
+            are compared at the impact itself, and f+ has no part, docs/theory.md, (RESTART).
+    """
     D = impact_derivative(model, before)
-    x, tangent = before.states[-1], math.tan(slope)
-    st = STANCES.index(before.stance)
-    normal = np.zeros(4)
-    # Gradient of the height of the swing foot, (GUARD), over the leg length.
-    normal[st] = -math.sin(x[st]) + tangent * math.cos(x[st])
-    normal[1 - st] = math.sin(x[1 - st]) - tangent * math.cos(x[1 - st])
+    normal = guard_gradient(before.stance, before.states[-1], slope)
     f_minus, f_plus = before.rates[-1], after.rates[0]
     approach = normal @ f_minus
     if not approach < 0:
         raise TrajectoryError(
             f'the swing foot does not come down at {before.end:.3f} s; its impact has no instant'
         )
-    return D + np.outer(f_plus - D @ f_minus, normal) / approach
+    moved_on = np.zeros(4) if restarts else f_plus
+    return D + np.outer(moved_on - D @ f_minus, normal) / approach
+
+
+def guard_gradient(stance: str, x: np.ndarray, slope: float = 0.0) -> np.ndarray:
+    """Gradient of the height of the swing foot, (GUARD), over the leg length: shape (4,)."""
+    st, tangent = STANCES.index(stance), math.tan(slope)
+    normal = np.zeros(4)
+    normal[st] = -math.sin(x[st]) + tangent * math.cos(x[st])
+    normal[1 - st] = math.sin(x[1 - st]) - tangent * math.cos(x[1 - st])
+    return normal

@@ -10,7 +10,7 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.impact import impact
 from cg_dynamics.rig import Setup
 
-TASK = [0.03, 0.02, 0.1, 0.05, 0.1, 0.05]
+TASK = [0.03, 0.02, 0.1, 0.05, 0.1, 0.05, 0.4]
 CASES = [
     Structure(('inner',), (4,)),
     Structure(('inner', 'outer'), (3, 4), rate_limited=True, clearance=True),
@@ -19,6 +19,8 @@ CASES = [
     Structure(('outer', 'inner'), (2, 2), goal='tube'),
     Structure(('inner',), (3,), goal='stretch', elastic=True),
     Structure(('inner',), (3,), periodic=True, elastic=True),
+    Structure(('inner', 'outer'), (3, 2), periodic=True, clocked=True),
+    Structure(('outer', 'inner'), (2, 2), clocked=True, elastic=True),
 ]
 
 
