@@ -16,17 +16,22 @@ from dataclasses import dataclass, fields, replace
 import casadi as ca
 import numpy as np
 
+from cg_control.collocation import planning_model
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
+from cg_control.tvlqr import linearised
+from cg_dynamics.linearise import without_dry_friction
+from cg_dynamics.model import Model
 
 # Deviations that weigh alike: 0.1 rad and 0.3 rad/s, as in the planner.
 UNITS = np.array([0.1, 0.1, 0.3, 0.3])
+TORQUE = 10.0  # N m that weigh as much
 IMPACT = np.array([1.0, 1.0, 0.0, 0.0])  # gradient of the impact surface on even ground
 METHODS = ('widest', 'flow')
 SLOW = 1.0  # units per second, below which a motion has no direction that a plane could follow
 CLOSED = 1e-3  # rad off the impact surface that a plan may leave: above what collocation errs
 APART = 0.02  # rad between the legs, below which they pass each other
-FLATTEST = 0.2  # least cosine between flow and normal, in units, where the plane is free
-EVEN = 1e-3  # weight of the mean of squared turning beside the largest one: it makes planes unique
+NODES = 25  # at which planes may begin to turn otherwise
+ROUNDS, SETTLED = 20, 2e-3  # of the search for the widest surfaces; share of the radius
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,7 @@ def between(phase: Phase, share: float) -> Points:
 
 def with_surfaces(
     trajectory: Trajectory,
+    model: Model,
     method: str = 'widest',
     last: np.ndarray | None = None,
     units: np.ndarray = UNITS,
@@ -93,6 +99,8 @@ def with_surfaces(
     """
     if method not in METHODS:
         raise ValueError(f'method is {method!r}; allowed are {", ".join(METHODS)}')
+    trajectory.require_model(model)
+    design = design_of(trajectory, model)
     slope = trajectory.provenance.get('slope', 0.0)
     phases = []
     for number, phase in enumerate(trajectory.phases):
@@ -106,9 +114,15 @@ def with_surfaces(
                 ends[0] if first == 0 else None,
                 ends[1] if end == len(phase.time) - 1 else None,
             )
-            normals[part] = _normals(phase, part, method, given, units)
+            normals[part] = _normals(design, phase, part, method, given, units)
         phases.append(replace(phase, normals=normals))
     return trajectory.with_phases(tuple(phases), surfaces=method)
+
+
+def design_of(trajectory: Trajectory, model: Model) -> Model:
+    """What feedback is designed on: the model as it is planned on, less dry friction."""
+    friction = trajectory.provenance.get('friction') == 'planned'
+    return without_dry_friction(planning_model(model, friction))
 
 
 def in_double_support(x: np.ndarray, slope: float) -> bool:
@@ -133,7 +147,7 @@ def _runs(yes: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2) if b - a >= 2]
 
 
-def _normals(phase, part, method, given, units) -> np.ndarray:
+def _normals(design, phase, part, method, given, units) -> np.ndarray:
     """Normals (n, 4) of one stretch, n'x0' = 1 at each knot."""
     flow = phase.rates[part] / units
     if method == 'flow':
@@ -146,66 +160,148 @@ def _normals(phase, part, method, given, units) -> np.ndarray:
                     f'the {phase.stance} phase {end} on a surface that it does not cross upward: '
                     f"n'dx0/dt is {normal @ f:.3g}"
                 )
-        y = _widest(np.diff(phase.time[part]), flow, ends)
+        A, B = linearised(design, phase.stance, phase.states[part], phase.torque[part])
+        y = Widest(
+            phase.time[part], flow, A * units / units[:, None], B[:, :, 0] * TORQUE / units, ends
+        ).solve()
     normals = y / units
     return normals / (normals * phase.rates[part]).sum(axis=1, keepdims=True)
 
 
-def _widest(h: np.ndarray, flow: np.ndarray, ends: list[np.ndarray | None]) -> np.ndarray:
-    """Directions y (n + 1, 4) that minimise the largest |dy/ds| / y'flow, as (WIDE) says."""
-    n = len(h)
-    speed = np.linalg.norm(flow, axis=1).max()
-    flow, h = flow / speed, h * speed  # lengths of the motion in units, for the solver's sake
-    y, rho = ca.MX.sym('y', 4, n + 1), ca.MX.sym('rho')
-    turning = ca.sum1((y[:, 1:] - y[:, :-1]) ** 2).T / h**2
-    crossing = ca.sum1(y * flow.T).T
-    rows, lower, upper = [], [], []
+class Widest:
+    """(WIDE): directions y at the knots, linear in between at most NODES of them.
 
-    def add(row, low, high):
-        rows.append(row)
-        lower.extend([low] * row.numel())
-        upper.extend([high] * row.numel())
+    With the ratio of each knot,
 
-    add(rho**2 * crossing[:-1] ** 2 - turning, 0.0, math.inf)
-    add(rho**2 * crossing[1:] ** 2 - turning, 0.0, math.inf)
-    # A given end may be flatter, but must be crossed.
-    along = flow / np.linalg.norm(flow, axis=1, keepdims=True)
-    for k in range(0 if ends[0] is None else 1, n + 1 if ends[1] is None else n):
-        add(y[:, k].T @ along[k], 0.0, math.inf)
-        add((y[:, k].T @ along[k]) ** 2 - FLATTEST**2 * ca.sumsqr(y[:, k]), 0.0, math.inf)
-    add(crossing[[0, n]], 0.0, math.inf)
-    guess = along
-    length = np.concatenate([[0.0], np.cumsum(h)]) / h.sum()
-    # Along with y every multiple is a solution: the first end, or any, gets a length.
-    if ends[0] is None and ends[1] is None:
-        add(y[:, 0].T @ guess[0], 1.0, 1.0)
-    for column, normal in ((0, ends[0]), (n, ends[1])):
-        if normal is None:
-            continue
-        normal = normal / np.linalg.norm(normal)
-        near = np.clip(1 - 4 * np.abs(length - length[column]), 0, 1)[:, None]
-        guess = (1 - near) * guess + near * normal
-        if column == 0 or ends[0] is None:
-            add(y[:, column] - normal, 0.0, 0.0)
-        else:
-            # Of any length, along the normal: orthogonal to what is orthogonal to it.
-            add(ca.DM(np.linalg.svd(normal[None])[2][1:]) @ y[:, column], 0.0, 0.0)
-    change = np.sum(np.diff(guess, axis=0) ** 2, axis=1) / h**2
-    cross = np.maximum((guess * flow).sum(axis=1), 0.1)
-    start = math.sqrt((change / np.minimum(cross[1:], cross[:-1]) ** 2).max())
-    solver = ca.nlpsol(
-        'widest', 'ipopt',
-        {'x': ca.vertcat(ca.vec(y), rho), 'g': ca.vertcat(*rows),
-         'f': rho**2 + EVEN * ca.dot(turning, h) / h.sum()},
-        {'print_time': False, 'ipopt': {'print_level': 0, 'sb': 'yes', 'max_iter': 300}},
-    )  # fmt: skip
-    found = solver(
-        x0=np.append(guess.ravel(), start), lbg=lower, ubg=upper,
-        lbx=[-math.inf] * guess.size + [0.0],
-    )  # fmt: skip
-    if not solver.stats()['success']:
-        raise TrajectoryError(
-            'no surfaces turn from one end of a phase to the other: '
-            f'{solver.stats()["return_status"]}'
+        g = max(|dy/ds|, |(A'y - mu y, b'y)|) / y'flow,   the inverse of its least radius (TUBE),
+
+    the sum of the largest and the mean g is made small, by convex programs in y, a and t
+
+        min t + mean t_k   subject to   g y'flow <= a,  t_k <= t,   a = rho y'flow + t_k w
+
+    in which w is the crossing y'flow of the last round, and mu makes A'y - mu y orthogonal to the
+    y of the last round (after Dinkelbach 1967). The best y is kept, so that there are surfaces
+    even where the solver gives up.
+
+    Args:
+        time: Knots, shape (n,), s.
+        flow: dx0/dt in units, shape (n, 4), 1/s.
+        A: df/dx in units, shape (n, 4, 4), 1/s.
+        b: df/du in units, shape (n, 4), 1/s.
+        ends: Given normals in units at the first and last knot, or None.
+    """
+
+    def __init__(
+        self,
+        time: np.ndarray,
+        flow: np.ndarray,
+        A: np.ndarray,
+        b: np.ndarray,
+        ends: list[np.ndarray | None],
+    ):
+        speed = np.linalg.norm(flow, axis=1).max()
+        # One unit of time moves by at most one unit of the state.
+        self.flow, self.A, self.b, time = flow / speed, A / speed, b / speed, time * speed
+        nodes = np.unique(np.linspace(0, len(time) - 1, NODES).round().astype(int))
+        self.weights = np.array([np.interp(time, time[nodes], row) for row in np.eye(len(nodes))])
+        self.h = np.diff(time[nodes])
+        # Interval and knot of each row: a knot at a node belongs to two intervals.
+        self.rows = np.array([
+            (j, k) for j in range(len(self.h)) for k in range(nodes[j], nodes[j + 1] + 1)
+        ])  # fmt: skip
+        self.guess = flow[nodes] / np.linalg.norm(flow[nodes], axis=1, keepdims=True)
+        at = (time[nodes] - time[0]) / (time[-1] - time[0])
+        for node, normal in zip((0, -1), ends, strict=True):
+            if normal is not None:
+                near = np.clip(1 - 4 * np.abs(at - at[node]), 0, 1)[:, None]
+                self.guess = (1 - near) * self.guess + near * normal / np.linalg.norm(normal)
+        self._build(ends)
+
+    def _build(self, ends: list[np.ndarray | None]) -> None:
+        m, n = len(self.guess), len(self.flow)
+        y, a, t = ca.SX.sym('y', 4, m), ca.SX.sym('a', n), ca.SX.sym('t')
+        rho, w, mu = ca.SX.sym('rho'), ca.SX.sym('w', n), ca.SX.sym('mu', n)
+        turning = ca.sum1((y[:, 1:] - y[:, :-1]) ** 2).T / self.h**2
+        knots = ca.mtimes(y, ca.sparsify(ca.DM(self.weights)))
+        pulled = ca.horzcat(*(ca.DM(self.A[k].T) @ knots[:, k] for k in range(n)))
+        pulled -= knots * ca.repmat(mu.T, 4)
+        push = ca.sum1(knots * self.b.T).T
+        crossing = ca.sum1(knots * self.flow.T).T
+        slack = (a - rho * crossing) / w
+        interval, knot = self.rows.T.tolist()
+        above = [
+            a[knot] - turning[interval] / a[knot],
+            a - (ca.sum1(pulled**2).T + push**2) / a,
+            t - slack,
+            1.5 * w - crossing,  # or else y would grow for the sake of the mean
+        ]
+        zero = []
+        # With y every multiple of it is a solution: the first end that is given sets the length.
+        given = [node for node, normal in zip((0, m - 1), ends, strict=True) if normal is not None]
+        for node in given:
+            direction = self.guess[node]
+            if node == given[0]:
+                zero.append(y[:, node] - direction)
+            else:
+                zero.append(ca.DM(np.linalg.svd(direction[None])[2][1:]) @ y[:, node])
+                above.append(ca.dot(direction, y[:, node]))
+        if not given:
+            zero.append(ca.dot(self.guess[0], y[:, 0]) - 1)
+        rows, equal = ca.vertcat(*above), ca.vertcat(*zero)
+        self.lower = np.zeros(rows.numel() + equal.numel())
+        self.upper = np.append(np.full(rows.numel(), math.inf), np.zeros(equal.numel()))
+        self.least = np.concatenate([np.full(4 * m, -math.inf), np.full(n, 1e-6), [-math.inf]])
+        self.solver = ca.nlpsol(
+            'widest', 'ipopt',
+            {'x': ca.vertcat(ca.vec(y), a, t), 'p': ca.vertcat(rho, w, mu),
+             'g': ca.vertcat(rows, equal), 'f': t + ca.sum1(slack) / n},
+            {'print_time': False,
+             'ipopt': {'print_level': 0, 'sb': 'yes', 'max_iter': 100, 'tol': 1e-5}},
+        )  # fmt: skip
+
+    def ratios(self, y: np.ndarray) -> np.ndarray:
+        """g at the knots, shape (n,); infinite where the motion is not crossed."""
+        knots = self.weights.T @ y
+        crossing = (knots * self.flow).sum(axis=1)
+        turning = np.linalg.norm(np.diff(y, axis=0), axis=1) / self.h
+        size = np.linalg.norm(np.column_stack([
+            self._pulled(knots, self.along(knots)), (knots * self.b).sum(axis=1)
+        ]), axis=1)  # fmt: skip
+        interval, knot = self.rows.T
+        np.maximum.at(size, knot, turning[interval])
+        with np.errstate(divide='ignore'):
+            return np.where(crossing > 0, size / crossing, math.inf)
+
+    def _pulled(self, knots: np.ndarray, mu: np.ndarray) -> np.ndarray:
+        return np.einsum('kji,kj->ki', self.A, knots) - mu[:, None] * knots
+
+    def along(self, knots: np.ndarray) -> np.ndarray:
+        """The mu at which A'y - mu y is orthogonal to y."""
+        return (self._pulled(knots, np.zeros(len(knots))) * knots).sum(axis=1) / (
+            (knots**2).sum(axis=1)
         )
-    return np.asarray(found['x']).ravel()[:-1].reshape(n + 1, 4)
+
+    def solve(self) -> np.ndarray:
+        """Directions at the knots, shape (n, 4)."""
+        y = best = self.guess
+        ratios = self.ratios(y)
+        least = ratios.max() + ratios.mean()
+        for _ in range(ROUNDS):
+            knots = self.weights.T @ y
+            crossing = np.maximum((knots * self.flow).sum(axis=1), 0.01)
+            rho = min(ratios.max(), 100.0)
+            found = self.solver(
+                x0=np.concatenate([y.ravel(), rho * crossing + 0.01, [0.1]]),
+                p=np.concatenate([[rho], crossing, self.along(knots)]),
+                lbg=self.lower, ubg=self.upper, lbx=self.least,
+            )  # fmt: skip
+            y = np.asarray(found['x']).ravel()[: y.size].reshape(y.shape)
+            ratios = self.ratios(y)
+            before, sum_of_both = least, ratios.max() + ratios.mean()
+            if sum_of_both < least:
+                best, least = y, sum_of_both
+            if not sum_of_both < before * (1 - SETTLED):
+                break
+        if math.isinf(least):
+            raise TrajectoryError('no surfaces turn from one end of a phase to the other')
+        return self.weights.T @ best
