@@ -76,7 +76,7 @@ def orbit_nodes(
     Raises:
         TrajectoryError: The orbit holds hardly a robot.
     """
-    motion = stabilise_transversely(with_surfaces(orbit.trajectory, model), model, weights)
+    motion = stabilise_transversely(with_surfaces(orbit.trajectory), model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
     return Nodes.orbit(motion, model, [phase.cost_to_go / level for phase in motion.phases])
