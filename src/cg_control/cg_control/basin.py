@@ -112,10 +112,15 @@ class Basin:
         """c(a) in rad; zero beyond the amplitudes that were sampled."""
         return float(np.interp(swing, SWINGS, self.bounds, right=0.0))
 
-    def depth(self, x: np.ndarray) -> float:
-        """How far out a state is, as a share of the bound: inside if 1 or less."""
+    def depth(self, x: np.ndarray, any_swing: bool = False) -> float:
+        """How far out a state is, as a share of the bound: inside if 1 or less.
+
+        Args:
+            x: State, shape (4,) or longer.
+            any_swing: Beyond the amplitudes that were sampled the last bound counts.
+        """
         capture, stable, swing = self.modes.split(x)
-        bound = self.bound(swing)
+        bound = self.bound(min(swing, SWINGS[-1]) if any_swing else swing)
         return max(abs(capture), abs(stable)) / bound if bound > 0 else float('inf')
 
     def draw(self, rng: np.random.Generator, share: float = 1.0) -> np.ndarray:
