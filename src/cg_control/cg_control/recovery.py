@@ -291,13 +291,10 @@ class TreeController:
         return depth if depth == depth else math.inf  # this leg is no goal
 
     def _depth_in_basin(self, stance: str, x: np.ndarray) -> float:
-        """Squared, as a depth in a funnel is: both grow as a cost does.
-
-        A swing leg beyond the amplitudes that the basin was sampled at fells nobody by itself.
-        """
+        """Squared, as a depth in a funnel is: both grow as a cost does."""
         if self.balance.basins is None:
             return self._depth_in_goal(stance, x)
-        return self.balance.basins[stance].depth(x, any_swing=True) ** 2
+        return self.balance.basins[stance].depth_to_leave(x) ** 2
 
     def _followed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> Command:
         """The torque of the node that is followed after (SWITCH)."""
