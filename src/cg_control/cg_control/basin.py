@@ -118,6 +118,19 @@ class Basin:
         bound = self.bound(swing)
         return max(abs(capture), abs(stable)) / bound if bound > 0 else float('inf')
 
+    def depth_to_leave(self, x: np.ndarray) -> float:
+        """As `depth`, for a robot that is inside and swings its leg further than was sampled.
+
+        The last bound counts then, and up to twice the last amplitude is inside: there is no jump
+        that noise of the rates could fall over.
+        """
+        capture, stable, swing = self.modes.split(x)
+        bound = self.bound(min(swing, SWINGS[-1]))
+        if bound <= 0:
+            return float('inf')
+        beyond = swing / (2.0 * SWINGS[-1])
+        return max(abs(capture) / bound, abs(stable) / bound, beyond if beyond > 1.0 else 0.0)
+
     def draw(self, rng: np.random.Generator, share: float = 1.0) -> np.ndarray:
         """A random state (4,) inside, or inside a share of it."""
         swing = rng.uniform(0.0, SWINGS[-1])

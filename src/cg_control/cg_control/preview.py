@@ -105,15 +105,6 @@ class Preview:
         near = np.where(np.take_along_axis(elsewhere, order, axis=1), -1, self._entries[order])
         return np.hstack([near, self.tree.champions[np.asarray(leg)]])
 
-    def first_home(self, nodes: np.ndarray, x: np.ndarray) -> int:
-        """Index of the first of some nodes (m,) that brings a state (nx,) home, -1 for none."""
-        for first in range(0, len(nodes), WIDTH):
-            some = nodes[first : first + WIDTH]
-            home = self.brings_home(some, np.repeat(x[None], len(some), axis=0))
-            if home.any():
-                return first + int(home.argmax())
-        return -1
-
     def brings_home(
         self, node: np.ndarray, x: np.ndarray, elapsed: np.ndarray | None = None
     ) -> np.ndarray:

@@ -5,14 +5,16 @@ At every measurement, in this order:
     0. Where a branch leads from the home that the robot is at towards the one that is wanted, it
        takes that: upright when the balance controller holds it there, from an orbit when it comes
        by, inside the tube. Wanted is what the speed says.                             (DEPART)
-    1. On a way to upright, in the goal region of the leg that stands, the robot balances. It
-       leaves the basin of the balance controller for a funnel that holds it, or when it is far
-       out.                                                                              (HOME)
+    1. On a way to upright, in the goal region of the leg that stands, the robot balances. Once it
+       has been out of the basin of the balance controller for `patience`, or for the less the
+       further out it is, it leaves for what brings it home, or for lack of that at a depth of
+       `hold`.                                                                           (HOME)
     2. It follows its node as long as the funnel there holds it. It goes over to the node at
        which its state is least deep, if it has left its funnel, or if it is so much less deep
        there and home is not further.                                                    (SWITCH)
     3. Where no funnel holds it, the tree is previewed (preview.py): the robot stays on its way
-       if that brings it home in simulation, or goes over to an entry that does.       (PREVIEW)
+       if that brings it home in simulation, or goes over to an entry that does. The entries
+       are tried over as many samples as it takes, so that none is answered late.      (PREVIEW)
     4. Where nothing brings it home there is no torque, until something does.          (OUTSIDE)
 
 Nothing is planned meanwhile: what a push does to the state is answered by another node. A foot
@@ -20,7 +22,8 @@ that lands where no impact was planned is a state like any other.
 
 *Hysteresis.* A robot is in a funnel, or in the basin, until its depth there is `hold`; it enters
 at 1. A rival must be less deep by `margin`. The torque ends when nothing has held the state for
-`patience`. So noise at the edge of a funnel, or between two nodes, changes nothing. `hold` and
+`patience`. So noise at the edge of a funnel, or between two nodes, changes nothing. Nor does noise
+of the rates at home: it throws the state out of the basin at one sample or two. `hold` and
 `patience` are more than that: who comes by a node further out than rho often comes home, for rho
 is where one in a hundred does not, and from node to node it is ragged (levels.py). With previews
 funnels need neither `hold` nor `margin`: the way that the robot is on is simulated first.
@@ -40,6 +43,7 @@ from cg_control.preview import LANDING, Preview
 from cg_control.routes import UPRIGHT, Routes
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
+from cg_dynamics.batch import WIDTH
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_dynamics.settings import setting
@@ -48,6 +52,7 @@ FOLLOWING, OUTSIDE = 'following', 'outside'
 KEPT = 5000  # look-ups whose time is remembered
 CALM = 0.1  # depth in the goal region up to which a robot that stands begins to walk
 STAY, NOWHERE = -1, -2  # in place of a node to go over to
+NONE: np.ndarray = np.empty(0, int)  # no nodes
 
 
 @dataclass(frozen=True)
@@ -75,12 +80,14 @@ class RecoverySettings(BalanceSettings):
         maximum=10.0, live=True,
     )  # fmt: skip
     hold: float = setting(
-        4.0, 'depth at which the robot leaves the basin that it is in and, without previews, the '
-        'funnel; it enters at 1', minimum=1.0, maximum=1e6, live=True,
+        4.0, 'depth at which the robot leaves the basin that it is in, though nothing brings it '
+        'home, and, without previews, the funnel; it enters at 1', minimum=1.0, maximum=1e6,
+        live=True,
     )  # fmt: skip
     patience: float = setting(
-        0.03, 'time for which nothing has held the state after which the torque ends', unit='s',
-        minimum=0.0, maximum=1.0, live=True,
+        0.03, 'time for which nothing has held the state after which the torque ends, and for '
+        'which the state has been out of the basin, divided by the depth there, after which the '
+        'robot leaves it', unit='s', minimum=0.0, maximum=1.0, live=True,
     )  # fmt: skip
     margin: float = setting(
         2.0, 'by how much less deep a state must be elsewhere for the robot to go over',
@@ -128,18 +135,19 @@ class ReadyTree:
     routes: Routes
 
     @classmethod
-    def of(cls, tree: Tree, model: Model) -> 'ReadyTree':
+    def of(cls, tree: Tree, model: Model, sample_time: float = LANDING.sample_time) -> 'ReadyTree':
         """Make everything.
 
         Args:
             tree: The tree.
             model: The robot as it is known, which may be more than when the tree was grown.
+            sample_time: Over which the torque is held, s: in previews as on the robot.
 
         Raises:
             ValueError: The robot cannot be previewed: it has an input delay, say.
         """
         nodes = tree.nodes
-        preview = Preview(tree, model)
+        preview = Preview(tree, model, simulation=replace(LANDING, sample_time=sample_time))
         routes = Routes.of(nodes, tree.speeds)
         ready = cls(tree, Lookup(nodes), Tracker(nodes, model), preview, routes)
         # What is worked out once, when it is first asked for; the rollouts are compiled.
@@ -167,7 +175,7 @@ class TreeController:
         steps_taken: Impacts since it was told at which speed to walk.
         switches: How often the robot has gone over to another node while it followed one.
         lookup_times: Of the last look-ups, s.
-        preview_times: Of the last previews, s.
+        preview_times: Of previews at the last samples that had one, s.
     """
 
     def __init__(self, balance: BalanceController, settings: RecoverySettings):
@@ -177,9 +185,10 @@ class TreeController:
         self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._ready: ReadyTree | None = None
         self.preview_times: collections.deque[float] = collections.deque(maxlen=KEPT)
-        self._stance, self._torque, self._held_ns = '', 0.0, 0
+        self._stance, self._torque = '', 0.0
+        self._held_ns = self._home_ns = self._asked_ns = 0
         self._previewed_ns: int | None = None
-        self._verdict = NOWHERE
+        self._verdict, self._untried = NOWHERE, NONE
 
     @property
     def tree(self) -> Tree | None:
@@ -232,37 +241,43 @@ class TreeController:
         if self.mode == FOLLOWING and self._ready is not ready:
             self._rest(IDLE)
         if self._ready is not ready:
-            self._previewed_ns = None
+            self._search_anew()
         self._ready = ready
         if ready is not None:
             ready.tracker.settings = ready.preview.settings = self.settings.tracking
             # Beyond these angles nothing is followed, so nothing is promised either.
             ready.preview.simulation = replace(
-                LANDING, fall_angle=self.settings.fall_angle,
+                ready.preview.simulation, fall_angle=self.settings.fall_angle,
                 swing_angle=self.settings.largest_swing,
             )  # fmt: skip
 
     def interrupt(self) -> None:
         """States were missing: what was known of the motion is void."""
         self._rest(IDLE)
+        self._search_anew()
 
     def step(self, stamp_ns: int, stance: str, x: np.ndarray) -> Command:
         """The torque for a state; arguments as `BalanceController.step`."""
         x = np.asarray(x, float)
         landed, self._stance = stance != self._stance, stance
-        reason = self._doubt()
+        if landed:
+            self._search_anew()
+        reason, mode = self._doubt(), IDLE
+        if not reason:
+            reason, mode = self._nowhere(stance, x), OUTSIDE
         if reason:
-            self._rest(IDLE)
-            return Command(0.0, IDLE, reason)
-        reason = self._nowhere(stance, x)
-        if reason:
-            self._rest(OUTSIDE)
-            return Command(0.0, OUTSIDE, reason)
+            self._rest(mode)
+            self._search_anew()
+            return Command(0.0, mode, reason)
         self.steps_taken += landed and self.mode == FOLLOWING
         best = self._best(stance, x)
         self._depart(stamp_ns, stance, x)
-        command = self._balanced(stamp_ns, stance, x, landed, best)
-        return command or self._followed(stamp_ns, stance, x, best)
+        if self._at_home(stamp_ns, stance, x, landed):
+            self._search_anew()
+            command = self._balanced(stamp_ns, stance, x)
+            if command:
+                return command
+        return self._followed(stamp_ns, stance, x, best)
 
     def _doubt(self) -> str:
         if not self.settings.armed:
@@ -298,10 +313,9 @@ class TreeController:
         entry = ready.routes.towards(home, self.wanted).get(here)
         if entry is None or not self._ready_to_leave(stamp_ns, stance, x, entry):
             return
-        if self.mode == BALANCING:
-            self.balance.stop()
         self.mode, self.entered = FOLLOWING, entry
         tracker.begin(entry, elapsed)
+        self._search_anew()
 
     def _ready_to_leave(self, stamp_ns: int, stance: str, x: np.ndarray, entry: int) -> bool:
         """Whether the robot is calm enough to take a way to another home."""
@@ -310,34 +324,39 @@ class TreeController:
             return self._depth_here(stance, x) <= 1.0
         if self._depth_in_goal(stance, x) > CALM:
             return False
-        since = None if self._previewed_ns is None else (stamp_ns - self._previewed_ns) * 1e-9
-        if since is not None and 0.0 <= since < self.settings.preview_period:
+        if 0 <= stamp_ns - self._asked_ns < 1e9 * self.settings.preview_period:
             return False
-        self._previewed_ns = stamp_ns
+        self._asked_ns = stamp_ns
         return bool(self._ready.preview.brings_home(np.array([entry]), x[None])[0])
 
-    def _balanced(
-        self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool, best: Claim
-    ) -> Command | None:
-        """The balance controller's answer, where (HOME) gives it the robot."""
+    def _at_home(self, stamp_ns: int, stance: str, x: np.ndarray, landed: bool) -> bool:
+        """Whether (HOME) asks for nothing but the balance controller."""
         if self.way != Way.UPRIGHT:
+            return False
+        entering = self.mode != BALANCING or landed
+        self.depth = (self._depth_in_goal if entering else self._depth_in_basin)(stance, x)
+        if self.depth <= 1.0:
+            self._home_ns = stamp_ns
+            return True
+        # One sample far out may be noise: it takes the more of them the less they say.
+        out = 1e-9 * (stamp_ns - self._home_ns) * self.depth
+        return not entering and out < self.settings.patience
+
+    def _balanced(self, stamp_ns: int, stance: str, x: np.ndarray) -> Command | None:
+        """The balance controller's answer, unless it refuses."""
+        if self.mode != BALANCING:
+            torque = self._torque
+            if self.mode == FOLLOWING:
+                # What dies out is what the laws differ by, not what the state has changed by.
+                assert self._ready is not None
+                torque = self._ready.tracker.torque(stamp_ns * 1e-9, stance, x)
+            self.balance.take_over(torque)
+        command = self.balance.step(stamp_ns, stance, x)
+        if command.mode != BALANCING:
             return None
-        if self.mode == BALANCING and not landed:
-            depth = self._depth_in_basin(stance, x)
-            at_home = depth <= (1.0 if best.depth <= 1.0 else self.settings.hold)
-        else:
-            depth = self._depth_in_goal(stance, x)
-            at_home = depth <= 1.0
-        if at_home:
-            if self.mode != BALANCING:
-                self.balance.take_over(self._torque)
-            command = self.balance.step(stamp_ns, stance, x)
-            if command.mode == BALANCING:
-                self.mode, self.depth, self._torque = BALANCING, depth, command.torque
-                self.node = self.entered = -1
-                return command
-        self.balance.stop()
-        return None
+        self.mode, self._torque = BALANCING, command.torque
+        self.node = self.entered = -1
+        return command
 
     def _depth_in_goal(self, stance: str, x: np.ndarray) -> float:
         assert self._ready is not None
@@ -350,7 +369,7 @@ class TreeController:
         """Squared, as a depth in a funnel is: both grow as a cost does."""
         if self.balance.basins is None:
             return self._depth_in_goal(stance, x)
-        return self.balance.basins[stance].depth(x) ** 2
+        return self.balance.basins[stance].depth_to_leave(x) ** 2
 
     def _followed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> Command:
         """The torque of the node that is followed after (SWITCH)."""
@@ -361,6 +380,12 @@ class TreeController:
             torque = tracker.torque(stamp_ns * 1e-9, stance, x)
             here = self._depth_here(stance, x)
         onto = self._onto(stamp_ns, stance, x, best, here)
+        if onto == NOWHERE and self.mode == BALANCING:
+            # While entries are still being tried, any torque that holds is better than none.
+            held = len(self._untried) > 0 or self.depth <= self.settings.hold
+            command = self._balanced(stamp_ns, stance, x) if held else None
+            if command:
+                return command
         if onto == NOWHERE and self._waited(stamp_ns, here):
             self._rest(OUTSIDE)
             self.depth = best.depth
@@ -369,6 +394,7 @@ class TreeController:
             self._held_ns = stamp_ns
         if onto >= 0:
             self.switches += self.mode == FOLLOWING
+            self.balance.stop()
             tracker.begin(onto)
             self.entered = onto
             torque = tracker.torque(stamp_ns * 1e-9, stance, x)
@@ -382,9 +408,10 @@ class TreeController:
         self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim, here: float
     ) -> int:
         """The node to go over to, STAY or NOWHERE, by (SWITCH) and (PREVIEW)."""
+        if self.settings.preview and here > 1.0:  # NaN, where no depth is said, is not
+            return self._previewed(stamp_ns, stance, x, best)
+        self._untried = NONE
         if self.settings.preview:
-            if here > 1.0:  # NaN, where no depth is said, is not
-                return self._previewed(stamp_ns, stance, x, best)
             return STAY
         lost = here > self.settings.hold
         if lost and best.depth <= 1.0:
@@ -395,14 +422,13 @@ class TreeController:
         return NOWHERE if lost else STAY
 
     def _previewed(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim) -> int:
+        """The node to go over to, STAY or NOWHERE, by (PREVIEW)."""
         assert self._ready is not None
         underway = self.mode == FOLLOWING and not self._ready.tracker.left(stance)
         since = None if self._previewed_ns is None else (stamp_ns - self._previewed_ns) * 1e-9
-        if since is not None and 0.0 <= since < self.settings.preview_period:
-            if underway:
-                return self._verdict
-            if self.mode == OUTSIDE:
-                return NOWHERE
+        fresh = since is not None and 0.0 <= since < self.settings.preview_period
+        if fresh and not len(self._untried):
+            return self._verdict if underway else NOWHERE
         began = time.perf_counter()
         onto = self._way_home(stance, x, best, underway)
         self._previewed_ns, self._verdict = stamp_ns, STAY if onto >= 0 else onto
@@ -410,21 +436,33 @@ class TreeController:
         return onto
 
     def _way_home(self, stance: str, x: np.ndarray, best: Claim, underway: bool) -> int:
-        """STAY, if the way that the robot is on brings it home; else a node that does."""
+        """STAY, if the way that the robot is on brings it home; else a node that does.
+
+        One register full of rollouts a sample: what is still untried waits for the next one. So
+        NOWHERE is the last word only when nothing is untried.
+        """
         assert self._ready is not None
         preview, tracker = self._ready.preview, self._ready.tracker
-        if underway:
-            # At a root time stands still, whatever the clock says.
-            elapsed = 0.0 if tracker.done else tracker.elapsed
-            here = np.array([tracker.node])
-            if preview.brings_home(here, x[None], np.array([elapsed]))[0]:
+        if not len(self._untried):
+            nodes = preview.candidates(np.array([STANCES.index(stance)]), x[None])[0]
+            claimed = [best.node] if best.depth <= 1.0 else NONE
+            self._untried = np.concatenate([claimed, nodes[nodes >= 0]]).astype(int)
+            if underway:
+                # At a root time stands still, whatever the clock says.
+                elapsed = 0.0 if tracker.done else tracker.elapsed
+                here = np.array([tracker.node])
+                if not preview.brings_home(here, x[None], np.array([elapsed]))[0]:
+                    return NOWHERE
+                self._untried = NONE
                 return STAY
-        nodes = preview.candidates(np.array([STANCES.index(stance)]), x[None])[0]
-        nodes = nodes[nodes >= 0]
-        if best.depth <= 1.0:
-            nodes = np.concatenate([[best.node], nodes])
-        first = preview.first_home(nodes, x)
-        return int(nodes[first]) if first >= 0 else NOWHERE
+        some, self._untried = self._untried[:WIDTH], self._untried[WIDTH:]
+        if not len(some):
+            return NOWHERE
+        home = preview.brings_home(some, np.repeat(x[None], len(some), axis=0))
+        if not home.any():
+            return NOWHERE
+        self._untried = NONE
+        return int(some[home.argmax()])
 
     def _waited(self, stamp_ns: int, here: float) -> bool:
         """Whether the robot gives its node up. One whose plan is over has no choice."""
@@ -456,6 +494,10 @@ class TreeController:
     def _nearer(self, node: int) -> bool:
         assert self._ready is not None
         return bool(self._ready.tree.nodes.to_go[node] <= self.to_go)
+
+    def _search_anew(self) -> None:
+        """Whatever previews have said is about another state by now."""
+        self._previewed_ns, self._verdict, self._untried = None, NOWHERE, NONE
 
     def _rest(self, mode: str) -> None:
         """No torque from now on."""

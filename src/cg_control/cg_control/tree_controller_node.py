@@ -88,12 +88,12 @@ class TreeControllerNode(Node):
         given = settings.model_file
         path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
         model = Model.load(path)
-        self.design = LiveDesign(
-            path, model, settings, 1.0 / settings.sample_rate_hz, log=self.get_logger().info
-        )
+        sample_time = 1.0 / settings.sample_rate_hz
+        self.design = LiveDesign(path, model, settings, sample_time, log=self.get_logger().info)
         self.controller = TreeController(self.design.controller, settings)
         before = settings.grown_for
-        self.loader = TreeLoader(model, Model.load(model_path(before)) if before else model)
+        grown_for = Model.load(model_path(before)) if before else model
+        self.loader = TreeLoader(model, grown_for, sample_time)
         self.problem = 'no tree selected yet'
         self._selection: TreeSelection | None = None
         self._last_ns: int | None = None

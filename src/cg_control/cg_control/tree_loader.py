@@ -13,10 +13,11 @@ class TreeLoader:
     Args:
         model: The robot as it is known.
         grown_for: Trees of other models are refused.
+        sample_time: Over which the torque is held, s.
     """
 
-    def __init__(self, model: Model, grown_for: Model):
-        self._model, self._grown_for = model, grown_for
+    def __init__(self, model: Model, grown_for: Model, sample_time: float):
+        self._model, self._grown_for, self._sample_time = model, grown_for, sample_time
         self._lock = threading.Lock()
         self._asked = 0
         self._found: ReadyTree | ValueError | None = None
@@ -48,7 +49,8 @@ class TreeLoader:
     def _load(self, number: int, selection: TreeSelection) -> None:
         found: ReadyTree | ValueError
         try:
-            found = ReadyTree.of(selection.load(self._grown_for), self._model)
+            tree = selection.load(self._grown_for)
+            found = ReadyTree.of(tree, self._model, self._sample_time)
         except ValueError as error:
             found = error
         with self._lock:

@@ -14,8 +14,10 @@ from cg_control.growth import Grower, Region
 from cg_control.lookup import Claim, Lookup
 from cg_control.preview import Preview
 from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings, TreeController
+from cg_control.tracking import Tracker
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
+from cg_dynamics.batch import WIDTH
 from cg_dynamics.c_compiler import compiler
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.hybrid import Walker
@@ -24,6 +26,7 @@ from cg_dynamics.rig import STANCES
 COMPILED = pytest.mark.skipif(compiler() is None, reason='hundreds of rollouts')
 SAMPLE_NS = 2_000_000
 INNER = 0
+SEARCH = 9  # samples in which all candidates are tried, eight a sample
 
 
 @pytest.fixture(scope='module')
@@ -75,6 +78,15 @@ def tell(controller, tick, leg, x):
     return controller.step(tick * SAMPLE_NS, STANCES[leg], np.asarray(x, float))
 
 
+def tell_until(controller, tick, leg, x, samples=SEARCH):
+    """As `tell`, until it follows, as long as the search for a way home may take."""
+    for k in range(samples):
+        command = tell(controller, tick + k, leg, x)
+        if command.mode == FOLLOWING:
+            break
+    return command
+
+
 def test_it_follows_the_node_at_which_the_state_is_least_deep(make, starts, tree):
     for leg, x, node in zip(*(rows[:20] for rows in starts), strict=True):
         controller = make()
@@ -102,7 +114,7 @@ def test_at_home_it_balances_and_out_of_the_basin_it_follows_again(make, starts)
 
 
 def test_it_leaves_the_basin_for_a_funnel_and_otherwise_late(make, tree, ready, monkeypatch):
-    controller = make()
+    controller = make(patience=0.0)
     basin = controller.balance.basins['inner']
     edge, goal = basin.bounds[0], basin.bounds[-1]  # of the basin, and of the goal region in it
     just_out, far_out, between = (
@@ -118,13 +130,60 @@ def test_it_leaves_the_basin_for_a_funnel_and_otherwise_late(make, tree, ready, 
     assert tell(controller, 5, INNER, far_out).mode == OUTSIDE
 
 
-def test_the_balance_controller_takes_the_torque_over(make, tree):
-    """The difference to the torque before dies out; it does not jump."""
+@pytest.mark.parametrize(('out', 'samples'), [(1.05, 14), (2.1, 4), (4.0, 1)])
+def test_it_leaves_the_basin_the_sooner_the_further_out_it_is(make, out, samples):
+    """After patience / depth: 30 ms over out^2, in samples of 2 ms."""
+    controller = make()
+    basin = controller.balance.basins['inner']
+    x = basin.modes.state(out * basin.bounds[0], 0.0, 0.0, 0.0)
+    tell(controller, 0, INNER, np.zeros(4))
+    modes = [tell(controller, 1 + k, INNER, x).mode for k in range(15)]
+    assert modes[: samples - 1] == ['balancing'] * (samples - 1)
+    assert modes[samples - 1] in (FOLLOWING, OUTSIDE)
+
+
+@pytest.mark.parametrize('preview', [pytest.param(True, marks=COMPILED), False])
+def test_noise_of_the_rates_does_not_drive_it_from_home(make, robot, preview):
+    """At 0.1 rad/s balance alone stands; without patience the tree controller chatters."""
+    for leg in range(2):
+        found = noisy_modes(make(preview=preview), robot, leg)
+        assert found == ['balancing'] * 1000
+        found = noisy_modes(make(preview=preview, patience=0.0), robot, leg)
+        assert sum(a != b for a, b in itertools.pairwise(found)) > 5
+
+
+def noisy_modes(controller, robot, leg):
+    """Modes of 2 s that begin upright, with white noise on the rates, or until the robot falls."""
+    walker = Walker(robot, dataclasses.replace(LANDING, fall_angle=1.4), None)
+    legs, x, modes = [walker.stand(stance) for stance in STANCES], np.zeros(4), []
+    rng, noise = np.random.default_rng(7), np.zeros(4)
+    for tick in range(1000):
+        command = tell(controller, tick, leg, x + noise)
+        modes.append(command.mode)
+        then, x = walker.move(legs[leg], x, walker.inputs(command.torque), 0.002, tick * 0.002)
+        leg = STANCES.index(then.stance)
+        if abs(x[leg]) > 0.4:
+            break
+        noise[2:] = 0.1 * rng.standard_normal(2)
+    return modes
+
+
+def test_the_balance_controller_takes_the_torque_over(make, ready, starts):
+    """What the law before asks for at this very state dies out: the torque does not jump."""
     controller, calm = make(hand_over=1.0), make(hand_over=1.0)
-    x = np.array([0.004, 0.0, 0.0, 0.0])
-    controller.mode, controller._torque = FOLLOWING, 20.0
-    assert tell(controller, 0, INNER, x).torque == pytest.approx(20.0)
-    assert tell(calm, 0, INNER, x).torque == pytest.approx(0.0)
+    leg, x, node = (rows[0] for rows in starts)
+    tell(controller, 0, leg, x)
+    home = np.full(4, 0.002)
+    assert controller.mode == FOLLOWING
+    wanted = Tracker(ready.tree.nodes, ready.preview.known, ready.tracker.settings, int(node))
+    wanted.begin(int(node))
+    wanted.torque(0.0, STANCES[leg], x)
+    torque = wanted.torque(0.002, STANCES[leg], home)
+    command = tell(controller, 1, leg, home)
+    assert command.mode == 'balancing'
+    assert command.torque == pytest.approx(torque)
+    assert abs(torque) > 5.0
+    assert tell(calm, 1, leg, home).torque == pytest.approx(0.0)
 
 
 def test_outside_every_funnel_there_is_no_torque_until_one_holds_the_state(
@@ -330,8 +389,49 @@ def test_what_no_funnel_holds_is_previewed(make, promised, unclaimed):
     for leg, x, entry in zip(*(rows[:10] for rows in promised), strict=True):
         assert tell(make(), 0, leg, x).mode == OUTSIDE
         controller = make(preview=True)
-        assert tell(controller, 0, leg, x).mode == FOLLOWING
+        assert tell_until(controller, 0, leg, x).mode == FOLLOWING
         assert controller.entered == controller.node == entry
+
+
+@COMPILED
+def test_a_sample_simulates_a_register_full_at_most(make, ready, promised, monkeypatch):
+    """Who comes home by a late candidate is found at a later sample, from its state then."""
+    leg, x, entry = promised
+    asked, simulate = [], ready.preview.brings_home
+    monkeypatch.setattr(
+        ready.preview, 'brings_home', lambda node, *rest: asked.append(len(node))
+        or simulate(node, *rest),
+    )  # fmt: skip
+    late = 0
+    for k in range(len(leg)):
+        tried = ready.preview.candidates(leg[k : k + 1], x[k : k + 1])[0]
+        place = int(np.flatnonzero(tried[tried >= 0] == entry[k])[0])
+        controller, before = make(preview=True), len(asked)
+        # At home at first: it goes on balancing while it looks for something better.
+        tell(controller, 0, leg[k], np.zeros(4))
+        for tick in range(place // WIDTH):
+            assert tell(controller, 1 + tick, leg[k], x[k]).mode == 'balancing'
+        assert tell(controller, 1 + place // WIDTH, leg[k], x[k]).mode == FOLLOWING
+        assert controller.entered == entry[k]
+        assert len(asked) - before == 1 + place // WIDTH
+        late += place >= WIDTH
+    assert late > 2
+    assert max(asked) == WIDTH
+
+
+@COMPILED
+def test_previews_hold_the_torque_for_as_long_as_the_loop_does(make, tree, robot, promised):
+    """At 40 ms some do not come home whom 2 ms promise it."""
+    leg, x, _ = promised
+    slow = ReadyTree.of(tree, robot, sample_time=0.04)
+    kept = slow.preview.choose(leg, x) >= 0
+    assert 0.5 < kept.mean() < 1.0
+    for k in np.flatnonzero(~kept):
+        controller = make(preview=True)
+        assert tell_until(controller, 0, leg[k], x[k]).mode == FOLLOWING
+        controller.take(slow)
+        controller.adopt(controller.settings)  # takes over its angles, not the sample time
+        assert tell_until(controller, SEARCH, leg[k], x[k]).mode == OUTSIDE
 
 
 @COMPILED
@@ -341,8 +441,8 @@ def test_nothing_is_followed_where_nothing_comes_home(make):
     for tick in range(50):
         command = tell(controller, tick, INNER, falling)
         assert (command.torque, command.mode) == (0.0, OUTSIDE)
-    # 0.1 s at one preview in 10 ms.
-    assert len(controller.preview_times) == 10
+    # 64 candidates, 8 a sample, and anew 10 ms later: 8 of every 12 samples.
+    assert len(controller.preview_times) == 34
 
 
 @COMPILED
@@ -388,7 +488,7 @@ def test_what_would_not_be_followed_is_not_promised(make, promised):
     leg, x, _ = (rows[:20] for rows in promised)
     modes = {
         swing: [
-            tell(make(preview=True, largest_swing=swing), 0, int(leg[k]), x[k]).mode
+            tell_until(make(preview=True, largest_swing=swing), 0, int(leg[k]), x[k]).mode
             for k in range(20)
         ]
         for swing in (2.0, 1.05)

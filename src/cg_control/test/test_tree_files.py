@@ -68,12 +68,12 @@ def test_a_tree_is_loaded_beside_whoever_asks(robot, monkeypatch):
     may_go_on = threading.Event()
     load = ReadyTree.of
 
-    def slowly(tree, model):
+    def slowly(tree, model, sample_time):
         assert may_go_on.wait(PATIENCE)
-        return load(tree, model)
+        return load(tree, model, sample_time)
 
     monkeypatch.setattr(tree_loader.ReadyTree, 'of', slowly)
-    loader = TreeLoader(robot, robot)
+    loader = TreeLoader(robot, robot, 0.002)
     loader.ask(TreeSelection.of(tree_path('compass_gait_mit')))
     assert loader.collect() is None
     may_go_on.set()
@@ -83,14 +83,14 @@ def test_a_tree_is_loaded_beside_whoever_asks(robot, monkeypatch):
 
 
 def test_the_last_question_counts(robot, tmp_path):
-    loader = TreeLoader(robot, robot)
+    loader = TreeLoader(robot, robot, 0.002)
     loader.ask(TreeSelection(str(tmp_path / 'none.npz'), 'f' * 64))
     loader.ask(TreeSelection.of(tree_path('compass_gait_mit')))
     assert isinstance(collected(loader), ReadyTree)
 
 
 def test_a_tree_of_another_robot_is_an_error_of_the_loader(robot):
-    loader = TreeLoader(*[Model.load(model_path('compass_gait_flexible'))] * 2)
+    loader = TreeLoader(*[Model.load(model_path('compass_gait_flexible'))] * 2, 0.002)
     loader.ask(TreeSelection.of(tree_path('compass_gait_mit')))
     with pytest.raises(TreeError, match='grown for a model with hash'):
         collected(loader)
