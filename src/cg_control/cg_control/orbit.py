@@ -212,6 +212,7 @@ def plan_orbit(
     slope: float = 0.0,
     torque_limit: float | None = None,
     retraction: float = math.inf,
+    approach: float = 0.05,
     near: Orbit | None = None,
     options: Options | None = None,
 ) -> Orbit:
@@ -224,6 +225,7 @@ def plan_orbit(
         slope: Fall of the ground ahead, rad.
         torque_limit: Of the motor, friction included, N m; None takes the model's.
         retraction: As in a `Task`.
+        approach: As in a `Task`; a foot that lands steeper needs less friction of the ground.
         near: An orbit of a similar demand, from which the search starts.
         options: Of the optimisation; by default guesses fit the demand.
 
@@ -242,7 +244,8 @@ def plan_orbit(
     task = Task(
         ('inner', 'outer'), Box.anywhere(), Box.anywhere(), periodic=True,
         torque_limit=torque_limit, slope=slope, retraction=retraction, reach=reach,
-        farthest=reach, total=(period, period), durations=(SHORTEST, period - SHORTEST),
+        farthest=reach, approach=approach, total=(period, period),
+        durations=(SHORTEST, period - SHORTEST),
     )  # fmt: skip
     if options is None:
         starts = tuple(Guess(angle, duration) for duration in (period / 2, 0.8, 0.3 * period))
