@@ -19,7 +19,7 @@ from cg_control.tvlqr import stabilise
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.gait import find_gait, section_coordinates, section_state
-from cg_dynamics.hybrid import WalkOptions
+from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact
 from cg_dynamics.rig import Setup
 
@@ -141,6 +141,23 @@ def test_knots_are_on_one_exact_motion(orbit):
             np.testing.assert_allclose(end, phase.states[k + 1], rtol=0, atol=1e-10)
 
 
+def test_the_walker_lands_when_the_orbit_does_and_not_before(orbit):
+    hold = 5e-4
+    for phase in orbit.trajectory.phases:
+
+        def command(t, stance, x, phase=phase):
+            return np.array([np.interp(phase.start + t + hold / 2, phase.time, phase.torque)])
+
+        duration = phase.end - phase.start
+        done = walk(
+            orbit.planned, phase.stance, phase.states[0], duration + 0.05, command,
+            WalkOptions(slope=SLOPE, step=hold, sample_time=hold, largest_steps=1),
+        )  # fmt: skip
+        assert [event.kind for event in done.events] == ['impact']
+        # The torque is held for a while, and the landing is flat.
+        assert done.time == pytest.approx(duration, abs=1e-5)
+
+
 def test_work_of_the_torque_is_what_impacts_and_the_climb_take(orbit, walker):
     """Motor and friction: none of these numbers is computed from the torque."""
     weight = walker.values['total_mass'] * walker.values['gravity']
@@ -242,6 +259,24 @@ def test_a_foot_that_lands_early_is_seen(walker, dip, early):
     states[0, 0] = 0.0
     phase = Phase('inner', np.arange(5.0), states, np.zeros((5, 4)), np.zeros(5))
     assert Sampled.of(phase, walker, 0.0).lands_early == early
+
+
+def test_a_second_search_keeps_the_foot_above_the_ground(walker, monkeypatch):
+    """Where the first finds nothing; and it is not asked where the foot is kept there anyway."""
+    depths = []
+
+    def found_nothing(model, task, *_):
+        depths.append(task.retraction)
+        raise PlanningError(f'nothing within {task.retraction} m', 7)
+
+    monkeypatch.setattr('cg_control.orbit._orbit', found_nothing)
+    with pytest.raises(PlanningError, match='nothing within inf') as caught:
+        plan_orbit(walker, 0.3, 0.3)
+    assert depths == [np.inf, 0.02]
+    assert caught.value.iterations == 14
+    with pytest.raises(PlanningError, match=r'nothing within 0\.01'):
+        plan_orbit(walker, 0.3, 0.3, retraction=0.01)
+    assert depths == [np.inf, 0.02, 0.01]
 
 
 def test_nonsense_is_refused(orbit, walker):
