@@ -8,7 +8,6 @@ motion of the exact hybrid model (`closing.py`).
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,12 +96,12 @@ class Orbit:
 
     @property
     def cost_of_transport(self) -> float:
-        """int |P| dt / (m g d): P power of the motor, with the friction it gives back; d way."""
+        """Mechanical: int |P| dt / (m g d), P the power of the motor, d the way."""
         return self._transport(np.abs)
 
     @property
     def positive_cost_of_transport(self) -> float:
-        """int max(P, 0) dt / (m g d): as if braking cost nothing."""
+        """As if braking cost nothing: int max(P, 0) dt / (m g d)."""
         return self._transport(lambda power: np.maximum(power, 0.0))
 
     def _transport(self, counted) -> float:
@@ -127,13 +126,14 @@ class Orbit:
 
     @property
     def friction_needed(self) -> float:
-        """Friction of the ground without which a foot slides, in stance or at an impact."""
-        ground = Ground(self.slope)
-        stance = max(float(np.abs(f[:, 0] / f[:, 1]).max()) for f in self.ground_forces)
-        return max(
-            stance,
-            *(abs(i.impulse @ ground.tangent / (i.impulse @ ground.normal)) for i in self.impacts),
-        )
+        """Friction of the ground without which the stance foot slides."""
+        return max(float(np.abs(f[:, 0] / f[:, 1]).max()) for f in self.ground_forces)
+
+    @property
+    def impact_friction_needed(self) -> float:
+        """Friction of the ground without which a foot slides as it lands."""
+        ground, impulses = Ground(self.slope), [struck.impulse for struck in self.impacts]
+        return max(float(abs(P @ ground.tangent / (P @ ground.normal))) for P in impulses)
 
     @property
     def foot_depth(self) -> float:
@@ -212,6 +212,7 @@ def plan_orbit(
     slope: float = 0.0,
     torque_limit: float | None = None,
     retraction: float = math.inf,
+    approach: float = 0.05,
     near: Orbit | None = None,
     options: Options | None = None,
 ) -> Orbit:
@@ -224,6 +225,7 @@ def plan_orbit(
         slope: Fall of the ground ahead, rad.
         torque_limit: Of the motor, friction included, N m; None takes the model's.
         retraction: As in a `Task`.
+        approach: As in a `Task`; a foot that lands steeper needs less friction of the ground.
         near: An orbit of a similar demand, from which the search starts.
         options: Of the optimisation; by default guesses fit the demand.
 
@@ -242,7 +244,8 @@ def plan_orbit(
     task = Task(
         ('inner', 'outer'), Box.anywhere(), Box.anywhere(), periodic=True,
         torque_limit=torque_limit, slope=slope, retraction=retraction, reach=reach,
-        farthest=reach, total=(period, period), durations=(SHORTEST, period - SHORTEST),
+        farthest=reach, approach=approach, total=(period, period),
+        durations=(SHORTEST, period - SHORTEST),
     )  # fmt: skip
     if options is None:
         starts = tuple(Guess(angle, duration) for duration in (period / 2, 0.8, 0.3 * period))

@@ -299,7 +299,7 @@ def jump_matrix(
         after: The phase that begins.
         slope: Of the ground, rad.
         restarts: The clock of what follows starts at the impact, whenever that is: deviations
-            are compared at the impact itself, and f+ has no part, docs/theory.md, (RESTART).
+            are compared at the impact itself, and f+ has no part, docs/walking.md, (RESTART).
     """
     D = impact_derivative(model, before)
     normal = guard_gradient(before.stance, before.states[-1], slope)

@@ -98,6 +98,35 @@ def test_limits_of_torque_and_its_rate_hold(robot):
     assert max(slopes) <= 0.8 * max(steep) * (1 + 1e-4)
 
 
+def test_steps_are_as_long_and_motions_take_as_much_time_as_allowed(robot):
+    free = optimise(robot, REBALANCE, friction=False)
+    q = free.phases[0].states[-1, :2]
+    reach = robot.values['leg_length'] * (np.sin(q[0]) - np.sin(q[1]))
+    short = 0.9 * reach
+    task = Task(('inner', 'outer'), reach=short, farthest=short)
+    shorter = optimise(robot, task, friction=False)
+    q = shorter.phases[0].states[-1, :2]
+    # The tolerance of a row.
+    assert robot.values['leg_length'] * (np.sin(q[0]) - np.sin(q[1])) == pytest.approx(
+        short, abs=1e-6
+    )
+    wanted = 1.2 * free.duration
+    slower = optimise(
+        robot, Task(('inner', 'outer'), reach=0.2, total=(wanted, wanted)), friction=False
+    )
+    assert slower.duration == pytest.approx(wanted, abs=1e-6)
+    between = Task(('inner', 'outer'), reach=0.2, total=(wanted, 2 * wanted))
+    assert optimise(robot, between, friction=False).duration == pytest.approx(wanted, abs=1e-3)
+
+
+def test_a_motion_nearby_spares_the_search(robot):
+    first = optimise(robot, REBALANCE, friction=False)
+    task = Task(('inner', 'outer'), Box.point([0.01, 0, 0, 0]), reach=0.2)
+    alone, near = (optimise(robot, task, friction=False, near=at) for at in (None, first))
+    assert near.provenance['iterations'] < alone.provenance['iterations'] / 2
+    assert near.provenance['cost'] == pytest.approx(alone.provenance['cost'], rel=1e-4)
+
+
 def test_retracted_foot_stays_within_its_retraction(robot):
     task = Task(('inner', 'outer'), reach=0.2, retraction=0.01)
     trajectory = optimise(robot, task, friction=False)
@@ -148,6 +177,8 @@ def test_a_plan_depends_on_no_clock(robot, monkeypatch):
         (lambda: Task(('left',)), "'left' is not one of inner, outer"),
         (lambda: Task(('inner',), torque_limit=-1.0), 'must not be negative'),
         (lambda: Task(('inner',), durations=(1.0, 0.5)), 'increasing'),
+        (lambda: Task(('inner',), total=(1.0, 0.5)), 'not decreasing'),
+        (lambda: Task(('inner',), reach=0.3, farthest=0.2), 'above farthest'),
     ],
 )
 def test_nonsense_is_refused(make, message):
