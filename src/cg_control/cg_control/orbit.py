@@ -29,6 +29,7 @@ from cg_dynamics.unpinned import ground_reaction
 PASSED = 0.02  # m the swing foot must be ahead for an impact: WalkOptions.minimum_step
 SAMPLES = 20  # of an interval, where a motion is measured
 SHORTEST = 0.1  # s of a phase
+KEPT_ABOVE = 0.02  # m of retraction that a second search allows
 INTERVALS = 25
 
 
@@ -85,9 +86,7 @@ class Orbit:
     @functools.cached_property
     def samples(self) -> tuple['Sampled', ...]:
         """Each phase between its knots."""
-        return tuple(
-            Sampled.of(phase, self.model, self.slope) for phase in self.trajectory.phases
-        )
+        return tuple(Sampled.of(phase, self.model, self.slope) for phase in self.trajectory.phases)
 
     @property
     def peak_torque(self) -> float:
@@ -239,7 +238,7 @@ def plan_orbit(
         raise ValueError(
             f'step_length is {step_length} m; it must be positive and below twice the leg length'
         )
-    period, angle = 2 * step_length / speed, half_angle(model, step_length)
+    period = 2 * step_length / speed
     reach = step_length * math.cos(slope)
     task = Task(
         ('inner', 'outer'), Box.anywhere(), Box.anywhere(), periodic=True,
@@ -248,13 +247,39 @@ def plan_orbit(
         durations=(SHORTEST, period - SHORTEST),
     )  # fmt: skip
     if options is None:
-        starts = tuple(Guess(angle, duration) for duration in (period / 2, 0.8, 0.3 * period))
+        durations = (period / 2, 0.8, 0.3 * period)
+        angle = half_angle(model, step_length)
+        starts = tuple(Guess(angle, duration) for duration in durations)
         options = Options(fine=INTERVALS, starts=starts, coarse_iterations=60)
     start = None if near is None else _hastened(near.trajectory, period / near.period)
+    try:
+        return _orbit(model, task, options, start, step_length)
+    except PlanningError as error:
+        # What keeps its foot above the ground is an orbit all the same, and found elsewhere.
+        if retraction <= KEPT_ABOVE:
+            raise
+        try:
+            careful = replace(task, retraction=KEPT_ABOVE)
+            return _orbit(model, careful, options, start, step_length)
+        except PlanningError as again:
+            error.iterations += again.iterations
+        raise error from None
+
+
+def _orbit(
+    model: Model, task: Task, options: Options, start: Trajectory | None, step_length: float
+) -> Orbit:
     plan = optimise(model, task, options, friction=False, near=start)
-    exact = closed(plan, planning_model(model, friction=False), angle, period, slope)
-    orbit = Orbit(exact, model)
+    assert task.total is not None, 'an orbit has a period'
+    orbit = Orbit(
+        closed(
+            plan, planning_model(model, friction=False), half_angle(model, step_length),
+            task.total[0], task.slope,
+        ),
+        model,
+    )  # fmt: skip
     if orbit.problem:
+        speed = 2 * step_length / task.total[0]
         raise PlanningError(
             f'at {speed:g} m/s with steps of {step_length:g} m {orbit.problem}',
             plan.provenance['iterations'],
