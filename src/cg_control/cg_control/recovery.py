@@ -72,8 +72,8 @@ class RecoverySettings(BalanceSettings):
         live=True,
     )  # fmt: skip
     pull: float = setting(
-        5.0, 'phase: rate at which the phase is drawn to the closest point', unit='1/s',
-        minimum=0.0, maximum=100.0, live=True,
+        5.0, 'phase: rate at which the phase is drawn to the surface that holds the state',
+        unit='1/s', minimum=0.0, maximum=1000.0, live=True,
     )  # fmt: skip
     fastest: float = setting(
         2.0, 'phase: largest rate of the phase, and the inverse of the least', minimum=1.0,
