@@ -54,6 +54,7 @@ setup(
             *(NODES if find_spec('rclpy') else []),
             'cost_tuning = cg_control.cost_tuning:main',
             'grow_tree = cg_control.grow_tree:main',
+            'plan_walk = cg_control.plan_walk:main',
         ],
     },
 )

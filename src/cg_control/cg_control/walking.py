@@ -76,7 +76,7 @@ def orbit_nodes(
     Raises:
         TrajectoryError: The orbit holds hardly a robot.
     """
-    motion = stabilise_transversely(with_surfaces(orbit.trajectory), model, weights)
+    motion = stabilise_transversely(with_surfaces(orbit.trajectory, model), model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
     return Nodes.orbit(motion, model, [phase.cost_to_go / level for phase in motion.phases])
@@ -135,6 +135,8 @@ def buried(x: np.ndarray, leg: np.ndarray, slope: float = 0.0) -> np.ndarray:
 def _across(nodes: Nodes, node: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Deviations of cost one on the surfaces of nodes, of random direction: (m, 4)."""
     values, vectors = np.linalg.eigh(nodes.F[node])
+    # Slow orbits amplify so much that rounding makes the least of the three negative.
+    values = np.maximum(values, 1e-9 * values[:, -1:])
     # S costs nothing along the flow: three directions are left.
     g = rng.standard_normal((len(node), 3))
     g /= np.linalg.norm(g, axis=1)[:, None]
