@@ -17,7 +17,7 @@ impact map Delta, its derivative D, the guard's gradient n and rates f before an
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -140,11 +140,7 @@ def stabilise(
         gains, costs = riccati(design, phase, weights.Q(phase.stance), weights.R, S)
         S = costs[0]
         after = phase
-        phases.append(
-            Phase(
-                phase.stance, phase.time, phase.states, phase.rates, phase.torque, gains, costs
-            )
-        )
+        phases.append(replace(phase, gains=gains, cost_to_go=costs))
     return trajectory.with_phases(tuple(reversed(phases)), weights=vars(weights))
 
 
@@ -169,26 +165,59 @@ def riccati(
     u = np.concatenate([first[1], second[1], phase.torque])
     A, B = linearised(design, phase.stance, x, u)
     n = len(h)
-    weight = np.linalg.inv(R)
-    H = np.empty((2 * n, 8, 8))
-    H[:, :4, :4] = A[: 2 * n]
-    H[:, :4, 4:] = -(B[: 2 * n] @ weight) @ B[: 2 * n].transpose(0, 2, 1)
-    H[:, 4:, :4] = -Q
-    H[:, 4:, 4:] = -A[: 2 * n].transpose(0, 2, 1)
-    H1, H2 = H[:n], H[n:]
+    flows = hamiltonian_flows(
+        h, A[: 2 * n].reshape(2, n, 4, 4), B[: 2 * n].reshape(2, n, 4, 1), Q, R
+    )
+    costs = costs_backward(flows, S)
+    gains = (np.linalg.inv(R) @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
+    return gains, costs
+
+
+def hamiltonian_flows(
+    h: np.ndarray, A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray
+) -> np.ndarray:
+    """exp(-Omega) of (MAG4) for every interval, shape (n, 2m, 2m).
+
+    Args:
+        h: Lengths of the intervals, s, shape (n,).
+        A: At both Gauss points of each, shape (2, n, m, m).
+        B: As A, shape (2, n, m, 1).
+        Q: Shape (m, m), or one each as A.
+        R: Shape (1, 1).
+    """
+    m = A.shape[-1]
+    H = np.empty((*A.shape[:2], 2 * m, 2 * m))
+    H[..., :m, :m] = A
+    H[..., :m, m:] = -(B @ np.linalg.inv(R)) @ B.swapaxes(-1, -2)
+    H[..., m:, :m] = -Q
+    H[..., m:, m:] = -A.swapaxes(-1, -2)
+    return exponentials(-magnus(h, H))
+
+
+def magnus(h: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """Omega of (MAG4), shape (n, m, m), from H at both Gauss points, shape (2, n, m, m)."""
     step = h[:, None, None]
-    omega = step / 2 * (H1 + H2) - math.sqrt(3) / 12 * step**2 * (H1 @ H2 - H2 @ H1)
-    flow = exponentials(-omega)
-    costs = np.empty((n + 1, 4, 4))
+    commutator = H[0] @ H[1] - H[1] @ H[0]
+    return step / 2 * (H[0] + H[1]) - math.sqrt(3) / 12 * step**2 * commutator
+
+
+def costs_backward(flows: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Costs to go at the n + 1 knots, shape (n + 1, m, m), from S at the last one.
+
+    Args:
+        flows: Of the n intervals, as `hamiltonian_flows` gives them.
+        S: Shape (m, m).
+    """
+    n, m = len(flows), flows.shape[-1] // 2
+    costs = np.empty((n + 1, m, m))
     costs[n] = S
-    constant, linear = flow[:, :, :4].copy(), flow[:, :, 4:].copy()
+    constant, linear = flows[:, :, :m].copy(), flows[:, :, m:].copy()
     for k in range(n - 1, -1, -1):
         XY = constant[k] + linear[k] @ S
         # LAPACK itself: numpy's checks take longer than four equations.
-        S = dgesv(XY[:4].T, XY[4:].T)[2]
+        S = dgesv(XY[:m].T, XY[m:].T)[2]
         costs[k] = S = (S + S.T) / 2
-    gains = (weight @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
-    return gains, costs
+    return costs
 
 
 def _between(phase: Phase, share: float) -> tuple[np.ndarray, np.ndarray]:
