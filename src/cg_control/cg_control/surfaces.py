@@ -25,8 +25,9 @@ METHODS = ('widest', 'flow')
 SLOW = 1.0  # units per second, below which a motion has no direction that a plane could follow
 CLOSED = 1e-3  # rad off the impact surface that a plan may leave: above what collocation errs
 APART = 0.02  # rad between the legs, below which they pass each other
-FLATTEST = 0.2  # least cosine between flow and normal, in units, where the plane is free
-EVEN = 1e-3  # weight of the mean of squared turning beside the largest one: it makes planes unique
+NODES = 25  # at which planes may begin to turn otherwise
+FLATTEST = 0.2  # least cosine between flow and normal, in units, at an end that is free
+ROUNDS, SETTLED = 20, 2e-3  # of the search for the widest surfaces; share of the radius
 
 
 @dataclass(frozen=True)
@@ -146,66 +147,105 @@ def _normals(phase, part, method, given, units) -> np.ndarray:
                     f'the {phase.stance} phase {end} on a surface that it does not cross upward: '
                     f"n'dx0/dt is {normal @ f:.3g}"
                 )
-        y = _widest(np.diff(phase.time[part]), flow, ends)
+        y = Widest(phase.time[part], flow, ends).solve()
     normals = y / units
     return normals / (normals * phase.rates[part]).sum(axis=1, keepdims=True)
 
 
-def _widest(h: np.ndarray, flow: np.ndarray, ends: list[np.ndarray | None]) -> np.ndarray:
-    """Directions y (n + 1, 4) that minimise the largest |dy/ds| / y'flow, as (WIDE) says."""
-    n = len(h)
-    speed = np.linalg.norm(flow, axis=1).max()
-    flow, h = flow / speed, h * speed  # lengths of the motion in units, for the solver's sake
-    y, rho = ca.MX.sym('y', 4, n + 1), ca.MX.sym('rho')
-    turning = ca.sum1((y[:, 1:] - y[:, :-1]) ** 2).T / h**2
-    crossing = ca.sum1(y * flow.T).T
-    rows, lower, upper = [], [], []
+class Widest:
+    """(WIDE): directions y (m, 4) at some knots, linear in between, crossed at all knots.
 
-    def add(row, low, high):
-        rows.append(row)
-        lower.extend([low] * row.numel())
-        upper.extend([high] * row.numel())
+    For a given bound rho of the turning |dy/ds| per crossing y'flow the program
 
-    add(rho**2 * crossing[:-1] ** 2 - turning, 0.0, math.inf)
-    add(rho**2 * crossing[1:] ** 2 - turning, 0.0, math.inf)
-    # A given end may be flatter, but must be crossed.
-    along = flow / np.linalg.norm(flow, axis=1, keepdims=True)
-    for k in range(0 if ends[0] is None else 1, n + 1 if ends[1] is None else n):
-        add(y[:, k].T @ along[k], 0.0, math.inf)
-        add((y[:, k].T @ along[k]) ** 2 - FLATTEST**2 * ca.sumsqr(y[:, k]), 0.0, math.inf)
-    add(crossing[[0, n]], 0.0, math.inf)
-    guess = along
-    length = np.concatenate([[0.0], np.cumsum(h)]) / h.sum()
-    # Along with y every multiple is a solution: the first end, or any, gets a length.
-    if ends[0] is None and ends[1] is None:
-        add(y[:, 0].T @ guess[0], 1.0, 1.0)
-    for column, normal in ((0, ends[0]), (n, ends[1])):
-        if normal is None:
-            continue
-        normal = normal / np.linalg.norm(normal)
-        near = np.clip(1 - 4 * np.abs(length - length[column]), 0, 1)[:, None]
-        guess = (1 - near) * guess + near * normal
-        if column == 0 or ends[0] is None:
-            add(y[:, column] - normal, 0.0, 0.0)
-        else:
-            # Of any length, along the normal: orthogonal to what is orthogonal to it.
-            add(ca.DM(np.linalg.svd(normal[None])[2][1:]) @ y[:, column], 0.0, 0.0)
-    change = np.sum(np.diff(guess, axis=0) ** 2, axis=1) / h**2
-    cross = np.maximum((guess * flow).sum(axis=1), 0.1)
-    start = math.sqrt((change / np.minimum(cross[1:], cross[:-1]) ** 2).max())
-    solver = ca.nlpsol(
-        'widest', 'ipopt',
-        {'x': ca.vertcat(ca.vec(y), rho), 'g': ca.vertcat(*rows),
-         'f': rho**2 + EVEN * ca.dot(turning, h) / h.sum()},
-        {'print_time': False, 'ipopt': {'print_level': 0, 'sb': 'yes', 'max_iter': 300}},
-    )  # fmt: skip
-    found = solver(
-        x0=np.append(guess.ravel(), start), lbg=lower, ubg=upper,
-        lbx=[-math.inf] * guess.size + [0.0],
-    )  # fmt: skip
-    if not solver.stats()['success']:
-        raise TrajectoryError(
-            'no surfaces turn from one end of a phase to the other: '
-            f'{solver.stats()["return_status"]}'
-        )
-    return np.asarray(found['x']).ravel()[:-1].reshape(n + 1, 4)
+        min t   subject to   |dy/ds|^2 / a <= a,   a = rho y'flow + t w
+
+    is convex. Its solution with t < 0 has a smaller largest ratio than rho, which is the next
+    rho; w, the crossings so far, makes the sequence converge fast (Dinkelbach 1967, Crouzeix and
+    others 1985). What was best is kept, so that it ends with surfaces even where IPOPT gives up.
+    """
+
+    def __init__(self, time: np.ndarray, flow: np.ndarray, ends: list[np.ndarray | None]):
+        speed = np.linalg.norm(flow, axis=1).max()
+        # One unit of time moves by at most one unit of the state.
+        self.flow, time = flow / speed, (time - time[0]) * speed
+        nodes = np.unique(np.linspace(0, len(time) - 1, NODES).round().astype(int))
+        self.weights = np.array([np.interp(time, time[nodes], row) for row in np.eye(len(nodes))])
+        self.h = np.diff(time[nodes])
+        # Interval and knot of each row: a knot at a node belongs to two intervals.
+        self.rows = np.array([
+            (j, k) for j in range(len(self.h)) for k in range(nodes[j], nodes[j + 1] + 1)
+        ])  # fmt: skip
+        self.guess = flow[nodes] / np.linalg.norm(flow[nodes], axis=1, keepdims=True)
+        at = time[nodes] / time[-1]
+        for node, normal in zip((0, -1), ends, strict=True):
+            if normal is not None:
+                near = np.clip(1 - 4 * np.abs(at - at[node]), 0, 1)[:, None]
+                self.guess = (1 - near) * self.guess + near * normal / np.linalg.norm(normal)
+        self._build(ends)
+
+    def _build(self, ends: list[np.ndarray | None]) -> None:
+        m, n = len(self.guess), len(self.flow)
+        y, a, t = ca.SX.sym('y', 4, m), ca.SX.sym('a', n), ca.SX.sym('t')
+        rho, w = ca.SX.sym('rho'), ca.SX.sym('w', n)
+        turning = ca.sum1((y[:, 1:] - y[:, :-1]) ** 2).T / self.h**2
+        crossing = ca.sum1(ca.mtimes(y, ca.sparsify(ca.DM(self.weights))) * self.flow.T).T
+        interval, knot = self.rows.T.tolist()
+        above = [a[knot] - turning[interval] / a[knot]]
+        zero = [rho * crossing + t * w - a]
+        # With y every multiple of it is a solution: the first end that is given sets the length.
+        given = [node for node, normal in zip((0, m - 1), ends, strict=True) if normal is not None]
+        for node in (0, m - 1):
+            direction = self.guess[node]
+            if node in given[1:]:
+                zero.append(ca.DM(np.linalg.svd(direction[None])[2][1:]) @ y[:, node])
+                above.append(ca.dot(direction, y[:, node]))
+            elif node in given:
+                zero.append(y[:, node] - direction)
+            else:
+                above.append(ca.dot(direction, y[:, node]) - FLATTEST * ca.norm_2(y[:, node]))
+                if not given and node == 0:
+                    zero.append(ca.dot(direction, y[:, node]) - 1)
+        rows, equal = ca.vertcat(*above), ca.vertcat(*zero)
+        self.lower = np.zeros(rows.numel() + equal.numel())
+        self.upper = np.append(np.full(rows.numel(), math.inf), np.zeros(equal.numel()))
+        self.least = np.concatenate([np.full(4 * m, -math.inf), np.full(n, 1e-6), [-math.inf]])
+        self.solver = ca.nlpsol(
+            'widest', 'ipopt',
+            {'x': ca.vertcat(ca.vec(y), a, t), 'p': ca.vertcat(rho, w),
+             'g': ca.vertcat(rows, equal), 'f': t},
+            {'print_time': False,
+             'ipopt': {'print_level': 0, 'sb': 'yes', 'max_iter': 100, 'tol': 1e-5}},
+        )  # fmt: skip
+
+    def largest_ratio(self, y: np.ndarray) -> float:
+        """Largest |dy/ds| / y'flow, infinite where the motion is not crossed."""
+        crossing = self.crossing(y)
+        if not (crossing > 0).all():
+            return math.inf
+        turning = np.linalg.norm(np.diff(y, axis=0), axis=1) / self.h
+        interval, knot = self.rows.T
+        return float((turning[interval] / crossing[knot]).max())
+
+    def crossing(self, y: np.ndarray) -> np.ndarray:
+        """y'flow at the knots."""
+        return ((self.weights.T @ y) * self.flow).sum(axis=1)
+
+    def solve(self) -> np.ndarray:
+        """Directions at the knots, shape (n, 4)."""
+        best, least = self.guess, self.largest_ratio(self.guess)
+        y = best
+        for _ in range(ROUNDS):
+            rho, crossing = min(least, 100.0), np.maximum(self.crossing(y), 0.01)
+            found = self.solver(
+                x0=np.concatenate([y.ravel(), rho * crossing + 0.01, [0.1]]),
+                p=np.append(rho, crossing), lbg=self.lower, ubg=self.upper, lbx=self.least,
+            )  # fmt: skip
+            y = np.asarray(found['x']).ravel()[: y.size].reshape(y.shape)
+            before, ratio = least, self.largest_ratio(y)
+            if ratio < least:
+                best, least = y, ratio
+            if not ratio < before * (1 - SETTLED):
+                break
+        if math.isinf(least):
+            raise TrajectoryError('no surfaces turn from one end of a phase to the other')
+        return self.weights.T @ best
