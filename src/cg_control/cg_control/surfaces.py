@@ -16,17 +16,21 @@ from dataclasses import dataclass, fields, replace
 import casadi as ca
 import numpy as np
 
+from cg_control.collocation import planning_model
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
+from cg_control.tvlqr import linearised
+from cg_dynamics.linearise import without_dry_friction
+from cg_dynamics.model import Model
 
 # Deviations that weigh alike: 0.1 rad and 0.3 rad/s, as in the planner.
 UNITS = np.array([0.1, 0.1, 0.3, 0.3])
+TORQUE = 10.0  # N m that weigh as much
 IMPACT = np.array([1.0, 1.0, 0.0, 0.0])  # gradient of the impact surface on even ground
 METHODS = ('widest', 'flow')
 SLOW = 1.0  # units per second, below which a motion has no direction that a plane could follow
 CLOSED = 1e-3  # rad off the impact surface that a plan may leave: above what collocation errs
 APART = 0.02  # rad between the legs, below which they pass each other
 NODES = 25  # at which planes may begin to turn otherwise
-FLATTEST = 0.2  # least cosine between flow and normal, in units, at an end that is free
 ROUNDS, SETTLED = 20, 2e-3  # of the search for the widest surfaces; share of the radius
 
 
@@ -70,6 +74,7 @@ def between(phase: Phase, share: float) -> Points:
 
 def with_surfaces(
     trajectory: Trajectory,
+    model: Model,
     method: str = 'widest',
     last: np.ndarray | None = None,
     units: np.ndarray = UNITS,
@@ -94,6 +99,8 @@ def with_surfaces(
     """
     if method not in METHODS:
         raise ValueError(f'method is {method!r}; allowed are {", ".join(METHODS)}')
+    trajectory.require_model(model)
+    design = design_of(trajectory, model)
     slope = trajectory.provenance.get('slope', 0.0)
     phases = []
     for number, phase in enumerate(trajectory.phases):
@@ -107,9 +114,15 @@ def with_surfaces(
                 ends[0] if first == 0 else None,
                 ends[1] if end == len(phase.time) - 1 else None,
             )
-            normals[part] = _normals(phase, part, method, given, units)
+            normals[part] = _normals(design, phase, part, method, given, units)
         phases.append(replace(phase, normals=normals))
     return trajectory.with_phases(tuple(phases), surfaces=method)
+
+
+def design_of(trajectory: Trajectory, model: Model) -> Model:
+    """What feedback is designed on: the model as it is planned on, less dry friction."""
+    friction = trajectory.provenance.get('friction') == 'planned'
+    return without_dry_friction(planning_model(model, friction))
 
 
 def in_double_support(x: np.ndarray, slope: float) -> bool:
@@ -134,7 +147,7 @@ def _runs(yes: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2) if b - a >= 2]
 
 
-def _normals(phase, part, method, given, units) -> np.ndarray:
+def _normals(design, phase, part, method, given, units) -> np.ndarray:
     """Normals (n, 4) of one stretch, n'x0' = 1 at each knot."""
     flow = phase.rates[part] / units
     if method == 'flow':
@@ -147,27 +160,48 @@ def _normals(phase, part, method, given, units) -> np.ndarray:
                     f'the {phase.stance} phase {end} on a surface that it does not cross upward: '
                     f"n'dx0/dt is {normal @ f:.3g}"
                 )
-        y = Widest(phase.time[part], flow, ends).solve()
+        A, B = linearised(design, phase.stance, phase.states[part], phase.torque[part])
+        y = Widest(
+            phase.time[part], flow, A * units / units[:, None], B[:, :, 0] * TORQUE / units, ends
+        ).solve()
     normals = y / units
     return normals / (normals * phase.rates[part]).sum(axis=1, keepdims=True)
 
 
 class Widest:
-    """(WIDE): directions y (m, 4) at some knots, linear in between, crossed at all knots.
+    """(WIDE): directions y at the knots, linear in between at most NODES of them.
 
-    For a given bound rho of the turning |dy/ds| per crossing y'flow the program
+    With the ratio of each knot,
 
-        min t   subject to   |dy/ds|^2 / a <= a,   a = rho y'flow + t w
+        g = max(|dy/ds|, |(A'y - mu y, b'y)|) / y'flow,   the inverse of its least radius (TUBE),
 
-    is convex. Its solution with t < 0 has a smaller largest ratio than rho, which is the next
-    rho; w, the crossings so far, makes the sequence converge fast (Dinkelbach 1967, Crouzeix and
-    others 1985). What was best is kept, so that it ends with surfaces even where IPOPT gives up.
+    the sum of the largest and the mean g is made small, by convex programs in y, a and t
+
+        min t + mean t_k   subject to   g y'flow <= a,  t_k <= t,   a = rho y'flow + t_k w
+
+    in which w is the crossing y'flow of the last round, and mu makes A'y - mu y orthogonal to the
+    y of the last round (after Dinkelbach 1967). The best y is kept, so that there are surfaces
+    even where the solver gives up.
+
+    Args:
+        time: Knots, shape (n,), s.
+        flow: dx0/dt in units, shape (n, 4), 1/s.
+        A: df/dx in units, shape (n, 4, 4), 1/s.
+        b: df/du in units, shape (n, 4), 1/s.
+        ends: Given normals in units at the first and last knot, or None.
     """
 
-    def __init__(self, time: np.ndarray, flow: np.ndarray, ends: list[np.ndarray | None]):
+    def __init__(
+        self,
+        time: np.ndarray,
+        flow: np.ndarray,
+        A: np.ndarray,
+        b: np.ndarray,
+        ends: list[np.ndarray | None],
+    ):
         speed = np.linalg.norm(flow, axis=1).max()
         # One unit of time moves by at most one unit of the state.
-        self.flow, time = flow / speed, (time - time[0]) * speed
+        self.flow, self.A, self.b, time = flow / speed, A / speed, b / speed, time * speed
         nodes = np.unique(np.linspace(0, len(time) - 1, NODES).round().astype(int))
         self.weights = np.array([np.interp(time, time[nodes], row) for row in np.eye(len(nodes))])
         self.h = np.diff(time[nodes])
@@ -176,7 +210,7 @@ class Widest:
             (j, k) for j in range(len(self.h)) for k in range(nodes[j], nodes[j + 1] + 1)
         ])  # fmt: skip
         self.guess = flow[nodes] / np.linalg.norm(flow[nodes], axis=1, keepdims=True)
-        at = time[nodes] / time[-1]
+        at = (time[nodes] - time[0]) / (time[-1] - time[0])
         for node, normal in zip((0, -1), ends, strict=True):
             if normal is not None:
                 near = np.clip(1 - 4 * np.abs(at - at[node]), 0, 1)[:, None]
@@ -186,65 +220,87 @@ class Widest:
     def _build(self, ends: list[np.ndarray | None]) -> None:
         m, n = len(self.guess), len(self.flow)
         y, a, t = ca.SX.sym('y', 4, m), ca.SX.sym('a', n), ca.SX.sym('t')
-        rho, w = ca.SX.sym('rho'), ca.SX.sym('w', n)
+        rho, w, mu = ca.SX.sym('rho'), ca.SX.sym('w', n), ca.SX.sym('mu', n)
         turning = ca.sum1((y[:, 1:] - y[:, :-1]) ** 2).T / self.h**2
-        crossing = ca.sum1(ca.mtimes(y, ca.sparsify(ca.DM(self.weights))) * self.flow.T).T
+        knots = ca.mtimes(y, ca.sparsify(ca.DM(self.weights)))
+        pulled = ca.horzcat(*(ca.DM(self.A[k].T) @ knots[:, k] for k in range(n)))
+        pulled -= knots * ca.repmat(mu.T, 4)
+        push = ca.sum1(knots * self.b.T).T
+        crossing = ca.sum1(knots * self.flow.T).T
+        slack = (a - rho * crossing) / w
         interval, knot = self.rows.T.tolist()
-        above = [a[knot] - turning[interval] / a[knot]]
-        zero = [rho * crossing + t * w - a]
+        above = [
+            a[knot] - turning[interval] / a[knot],
+            a - (ca.sum1(pulled**2).T + push**2) / a,
+            t - slack,
+            1.5 * w - crossing,  # or else y would grow for the sake of the mean
+        ]
+        zero = []
         # With y every multiple of it is a solution: the first end that is given sets the length.
         given = [node for node, normal in zip((0, m - 1), ends, strict=True) if normal is not None]
-        for node in (0, m - 1):
+        for node in given:
             direction = self.guess[node]
-            if node in given[1:]:
-                zero.append(ca.DM(np.linalg.svd(direction[None])[2][1:]) @ y[:, node])
-                above.append(ca.dot(direction, y[:, node]))
-            elif node in given:
+            if node == given[0]:
                 zero.append(y[:, node] - direction)
             else:
-                above.append(ca.dot(direction, y[:, node]) - FLATTEST * ca.norm_2(y[:, node]))
-                if not given and node == 0:
-                    zero.append(ca.dot(direction, y[:, node]) - 1)
+                zero.append(ca.DM(np.linalg.svd(direction[None])[2][1:]) @ y[:, node])
+                above.append(ca.dot(direction, y[:, node]))
+        if not given:
+            zero.append(ca.dot(self.guess[0], y[:, 0]) - 1)
         rows, equal = ca.vertcat(*above), ca.vertcat(*zero)
         self.lower = np.zeros(rows.numel() + equal.numel())
         self.upper = np.append(np.full(rows.numel(), math.inf), np.zeros(equal.numel()))
         self.least = np.concatenate([np.full(4 * m, -math.inf), np.full(n, 1e-6), [-math.inf]])
         self.solver = ca.nlpsol(
             'widest', 'ipopt',
-            {'x': ca.vertcat(ca.vec(y), a, t), 'p': ca.vertcat(rho, w),
-             'g': ca.vertcat(rows, equal), 'f': t},
+            {'x': ca.vertcat(ca.vec(y), a, t), 'p': ca.vertcat(rho, w, mu),
+             'g': ca.vertcat(rows, equal), 'f': t + ca.sum1(slack) / n},
             {'print_time': False,
              'ipopt': {'print_level': 0, 'sb': 'yes', 'max_iter': 100, 'tol': 1e-5}},
         )  # fmt: skip
 
-    def largest_ratio(self, y: np.ndarray) -> float:
-        """Largest |dy/ds| / y'flow, infinite where the motion is not crossed."""
-        crossing = self.crossing(y)
-        if not (crossing > 0).all():
-            return math.inf
+    def ratios(self, y: np.ndarray) -> np.ndarray:
+        """g at the knots, shape (n,); infinite where the motion is not crossed."""
+        knots = self.weights.T @ y
+        crossing = (knots * self.flow).sum(axis=1)
         turning = np.linalg.norm(np.diff(y, axis=0), axis=1) / self.h
+        size = np.linalg.norm(np.column_stack([
+            self._pulled(knots, self.along(knots)), (knots * self.b).sum(axis=1)
+        ]), axis=1)  # fmt: skip
         interval, knot = self.rows.T
-        return float((turning[interval] / crossing[knot]).max())
+        np.maximum.at(size, knot, turning[interval])
+        with np.errstate(divide='ignore'):
+            return np.where(crossing > 0, size / crossing, math.inf)
 
-    def crossing(self, y: np.ndarray) -> np.ndarray:
-        """y'flow at the knots."""
-        return ((self.weights.T @ y) * self.flow).sum(axis=1)
+    def _pulled(self, knots: np.ndarray, mu: np.ndarray) -> np.ndarray:
+        return np.einsum('kji,kj->ki', self.A, knots) - mu[:, None] * knots
+
+    def along(self, knots: np.ndarray) -> np.ndarray:
+        """The mu at which A'y - mu y is orthogonal to y."""
+        return (self._pulled(knots, np.zeros(len(knots))) * knots).sum(axis=1) / (
+            (knots**2).sum(axis=1)
+        )
 
     def solve(self) -> np.ndarray:
         """Directions at the knots, shape (n, 4)."""
-        best, least = self.guess, self.largest_ratio(self.guess)
-        y = best
+        y = best = self.guess
+        ratios = self.ratios(y)
+        least = ratios.max() + ratios.mean()
         for _ in range(ROUNDS):
-            rho, crossing = min(least, 100.0), np.maximum(self.crossing(y), 0.01)
+            knots = self.weights.T @ y
+            crossing = np.maximum((knots * self.flow).sum(axis=1), 0.01)
+            rho = min(ratios.max(), 100.0)
             found = self.solver(
                 x0=np.concatenate([y.ravel(), rho * crossing + 0.01, [0.1]]),
-                p=np.append(rho, crossing), lbg=self.lower, ubg=self.upper, lbx=self.least,
+                p=np.concatenate([[rho], crossing, self.along(knots)]),
+                lbg=self.lower, ubg=self.upper, lbx=self.least,
             )  # fmt: skip
             y = np.asarray(found['x']).ravel()[: y.size].reshape(y.shape)
-            before, ratio = least, self.largest_ratio(y)
-            if ratio < least:
-                best, least = y, ratio
-            if not ratio < before * (1 - SETTLED):
+            ratios = self.ratios(y)
+            before, sum_of_both = least, ratios.max() + ratios.mean()
+            if sum_of_both < least:
+                best, least = y, sum_of_both
+            if not sum_of_both < before * (1 - SETTLED):
                 break
         if math.isinf(least):
             raise TrajectoryError('no surfaces turn from one end of a phase to the other')

@@ -17,8 +17,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cg_control.collocation import planning_model
-from cg_control.surfaces import UNITS, Points, between, in_double_support, with_planes
+from cg_control.surfaces import (
+    UNITS,
+    Points,
+    between,
+    design_of,
+    in_double_support,
+    with_planes,
+)
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_control.tvlqr import (
     GAUSS,
@@ -31,7 +37,6 @@ from cg_control.tvlqr import (
     linearised,
     magnus,
 )
-from cg_dynamics.linearise import without_dry_friction
 from cg_dynamics.model import Model
 
 SWEEPS = 200  # round the orbit, after which its Riccati equation is said not to converge
@@ -135,12 +140,6 @@ def stabilise_transversely(
         gains = (np.linalg.inv(weights.R) @ B.transpose(0, 2, 1) @ cost)[:, 0, :]
         phases.append(replace(phase, gains=gains, cost_to_go=cost))
     return trajectory.with_phases(tuple(phases), weights=vars(weights), feedback='transverse')
-
-
-def design_of(trajectory: Trajectory, model: Model) -> Model:
-    """What feedback is designed on: the model as it is planned on, less dry friction."""
-    friction = trajectory.provenance.get('friction') == 'planned'
-    return without_dry_friction(planning_model(model, friction))
 
 
 @dataclass(frozen=True)
