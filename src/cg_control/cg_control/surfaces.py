@@ -31,6 +31,7 @@ SLOW = 1.0  # units per second, below which a motion has no direction that a pla
 CLOSED = 1e-3  # rad off the impact surface that a plan may leave: above what collocation errs
 APART = 0.02  # rad between the legs, below which they pass each other
 NODES = 25  # at which planes may begin to turn otherwise
+NEWTON, INSTANT = 20, 1e-12  # steps of Newton's method, and what they settle to, s
 ROUNDS, SETTLED = 20, 2e-3  # of the search for the widest surfaces; share of the radius
 
 
@@ -87,6 +88,7 @@ def with_surfaces(
 
     Args:
         trajectory: Any; on ground of the slope that its provenance states.
+        model: The one it was planned for.
         method: 'widest': the least radius (TUBE) as large as it can be, impact surfaces at the
             ends; 'flow': normal to the motion in the metric of `units`, at the ends too.
         last: Normal at the very end, of any length, shape (4,), where the motion joins another
@@ -117,6 +119,86 @@ def with_surfaces(
             normals[part] = _normals(design, phase, part, method, given, units)
         phases.append(replace(phase, normals=normals))
     return trajectory.with_phases(tuple(phases), surfaces=method)
+
+
+@dataclass(frozen=True)
+class Tube:
+    """(TUBE) at the knots of a phase, in units; infinite where there are no surfaces.
+
+    Attributes:
+        well_posed: Up to here every state of the surface lies on no other one near it, shape (n,).
+        advancing: Up to here its phase advances under the nominal torque, n'f > 0, to first
+            order, shape (n,).
+    """
+
+    well_posed: np.ndarray
+    advancing: np.ndarray
+
+
+def tube(trajectory: Trajectory, model: Model, units: np.ndarray = UNITS) -> tuple[Tube, ...]:
+    """The tube of each phase.
+
+    Args:
+        trajectory: With surfaces.
+        model: The one it was planned for.
+        units: As in `with_surfaces`.
+    """
+    design = design_of(trajectory, model)
+    tubes = []
+    for phase in trajectory.phases:
+        well_posed, advancing = np.full((2, len(phase.time)), math.inf)
+        for first, last in with_planes(phase):
+            for share, shift in ((0.0, 0), (0.5, 0), (0.5, 1), (1.0, 1)):
+                points = between(phase, share).cut(slice(first, last))
+                at = slice(first + shift, last + shift)
+                radii = _radius(points.normals, points.rates, points.turning, units)
+                well_posed[at] = np.minimum(well_posed[at], radii)
+            part = slice(first, last + 1)
+            A, _ = linearised(design, phase.stance, phase.states[part], phase.torque[part])
+            normals = phase.normals[part]
+            pulled = np.einsum('kji,kj->ki', A, normals)
+            advancing[part] = _radius(normals, phase.rates[part], pulled, units)
+        tubes.append(Tube(well_posed, advancing))
+    return tuple(tubes)
+
+
+def _radius(normals, rates, gradient, units) -> np.ndarray:
+    """Distance in the surface, in units, at which gradient'd takes n'x0' away, shape (n,)."""
+    n, g = normals * units, gradient * units
+    g = g - (g * n).sum(axis=1, keepdims=True) / (n**2).sum(axis=1, keepdims=True) * n
+    with np.errstate(divide='ignore'):
+        return (normals * rates).sum(axis=1) / np.linalg.norm(g, axis=1)
+
+
+def phase_of(phase: Phase, x: np.ndarray, near: float) -> float:
+    """The instant s whose surface holds a state: n(s)'(x - x0(s)) = 0, by Newton's method.
+
+    Args:
+        phase: With surfaces.
+        x: Shape (4,).
+        near: Instant from which to search, s; a state may lie on more than one surface.
+
+    Returns:
+        The instant, within the phase: a state beyond the last surface is on the last one. Where
+        there are no surfaces, or they meet before x, `near` itself.
+    """
+    s = min(max(near, phase.start), phase.end)
+    for _ in range(NEWTON):
+        k = min(max(int(np.searchsorted(phase.time, s, side='right')) - 1, 0), len(phase.time) - 2)
+        piece = replace(
+            phase, **{f.name: getattr(phase, f.name)[k : k + 2] for f in fields(Phase)[1:]}
+        )
+        h = phase.time[k + 1] - phase.time[k]
+        point = between(piece, (s - phase.time[k]) / h).cut(slice(0, 1))
+        deviation = x - point.states[0]
+        fall = point.normals[0] @ point.rates[0] - point.turning[0] @ deviation
+        if not fall > 0:
+            return near
+        change = float(point.normals[0] @ deviation / fall)
+        before, s = s, min(max(s + change, phase.start), phase.end)
+        if abs(s - before) < INSTANT:
+            break
+    return s
 
 
 def design_of(trajectory: Trajectory, model: Model) -> Model:
@@ -260,12 +342,12 @@ class Widest:
         )  # fmt: skip
 
     def ratios(self, y: np.ndarray) -> np.ndarray:
-        """g at the knots, shape (n,); infinite where the motion is not crossed."""
+        """Ratios g at the knots, shape (n,); infinite where the motion is not crossed."""
         knots = self.weights.T @ y
         crossing = (knots * self.flow).sum(axis=1)
         turning = np.linalg.norm(np.diff(y, axis=0), axis=1) / self.h
         size = np.linalg.norm(np.column_stack([
-            self._pulled(knots, self.along(knots)), (knots * self.b).sum(axis=1)
+            self._pulled(knots, self._along(knots)), (knots * self.b).sum(axis=1)
         ]), axis=1)  # fmt: skip
         interval, knot = self.rows.T
         np.maximum.at(size, knot, turning[interval])
@@ -275,7 +357,7 @@ class Widest:
     def _pulled(self, knots: np.ndarray, mu: np.ndarray) -> np.ndarray:
         return np.einsum('kji,kj->ki', self.A, knots) - mu[:, None] * knots
 
-    def along(self, knots: np.ndarray) -> np.ndarray:
+    def _along(self, knots: np.ndarray) -> np.ndarray:
         """The mu at which A'y - mu y is orthogonal to y."""
         return (self._pulled(knots, np.zeros(len(knots))) * knots).sum(axis=1) / (
             (knots**2).sum(axis=1)
@@ -292,7 +374,7 @@ class Widest:
             rho = min(ratios.max(), 100.0)
             found = self.solver(
                 x0=np.concatenate([y.ravel(), rho * crossing + 0.01, [0.1]]),
-                p=np.concatenate([[rho], crossing, self.along(knots)]),
+                p=np.concatenate([[rho], crossing, self._along(knots)]),
                 lbg=self.lower, ubg=self.upper, lbx=self.least,
             )  # fmt: skip
             y = np.asarray(found['x']).ravel()[: y.size].reshape(y.shape)
