@@ -182,20 +182,34 @@ def phase_of(phase: Phase, x: np.ndarray, near: float) -> float:
         The instant, within the phase: a state beyond the last surface is on the last one. Where
         there are no surfaces, or they meet before x, `near` itself.
     """
+    time, states, rates, normals = phase.time, phase.states, phase.rates, phase.normals
     s = min(max(near, phase.start), phase.end)
     for _ in range(NEWTON):
-        k = min(max(int(np.searchsorted(phase.time, s, side='right')) - 1, 0), len(phase.time) - 2)
-        piece = replace(
-            phase, **{f.name: getattr(phase, f.name)[k : k + 2] for f in fields(Phase)[1:]}
+        k = min(int(np.searchsorted(time, s, side='right')), len(time) - 1) - 1
+        h = time[k + 1] - time[k]
+        late = (s - time[k]) / h
+        early = 1 - late
+        change = states[k + 1] - states[k]
+        # As `between` has it, written so that x0(s) costs little.
+        state = states[k] + late * (
+            late * (1 + 2 * early) * change
+            + h * early * (early * rates[k] - late * rates[k + 1])
         )
-        h = phase.time[k + 1] - phase.time[k]
-        point = between(piece, (s - phase.time[k]) / h).cut(slice(0, 1))
-        deviation = x - point.states[0]
-        fall = point.normals[0] @ point.rates[0] - point.turning[0] @ deviation
+        rate = (
+            6 * late * early / h * change
+            + early * (1 - 3 * late) * rates[k]
+            + late * (1 - 3 * early) * rates[k + 1]
+        )
+        normal, turning = normals[k], (normals[k + 1] - normals[k]) / h
+        if not (normals[k].any() and normals[k + 1].any()):
+            return near
+        normal = normal + late * h * turning
+        deviation = x - state
+        fall = normal.dot(rate) - turning.dot(deviation)
         if not fall > 0:
             return near
-        change = float(point.normals[0] @ deviation / fall)
-        before, s = s, min(max(s + change, phase.start), phase.end)
+        before = s
+        s = min(max(s + float(normal.dot(deviation) / fall), phase.start), phase.end)
         if abs(s - before) < INSTANT:
             break
     return s
