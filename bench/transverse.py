@@ -19,7 +19,7 @@ import numpy as np
 from cg_control.collocation import planning_model
 from cg_control.orbit import plan_orbit
 from cg_control.surfaces import METHODS, UNITS, phase_of, tube, with_surfaces
-from cg_control.transverse import monodromy, stabilise_transversely
+from cg_control.transverse import WALKING, monodromy, stabilise_transversely
 from cg_control.tvlqr import Weights, stabilise
 from cg_description.paths import model_path
 from cg_dynamics.hybrid import WalkOptions, walk
@@ -30,10 +30,15 @@ DEMANDS = (
     (0.15, 0.3, 0), (0.25, 0.3, 0), (0.25, 0.4, 0), (0.35, 0.3, 0), (0.35, 0.4, 0),
     (0.25, 0.4, 3), (0.25, 0.3, -3), (0.35, 0.4, -3),
 )  # fmt: skip
-WALKED = ((0.25, 0.3), (0.25, 0.4))
-TORQUES = (1 / 1600, 1 / 100, 1 / 10)
+WALKED = ((0.25, 0.3), (0.25, 0.4), (0.3, 0.3))
+WEIGHTS = {
+    'those of balance': Weights(),
+    'torque 1/100': Weights(torque=1 / 100),
+    'default': WALKING,
+    'even': Weights(100.0, 100.0, 11.0, 11.0, 1 / 100),
+}
 SIZES = (0.25, 0.5)
-STARTS, STEPS = 12, 6
+STARTS, STEPS = 10, 6
 RESULT = Path(__file__).parent / 'results' / 'transverse.md'
 
 
@@ -82,10 +87,10 @@ def walks_on(motion, start: np.ndarray, by_clock: bool) -> bool:
 def walks_row(speed: float, length: float) -> list[str]:
     motion = plan_orbit(ROBOT, speed, length).trajectory
     ways = {'over time, clock set at impacts (`tvlqr`)': (stabilise(motion, ROBOT), True)}
-    for method, torque in (*(('widest', r) for r in TORQUES), ('flow', TORQUES[0])):
+    for method, name in (*(('widest', name) for name in WEIGHTS), ('flow', 'default')):
         planes = with_surfaces(motion, ROBOT, method)
-        found = stabilise_transversely(planes, ROBOT, Weights(torque=torque))
-        ways[f'transverse, {method}, torque 1/{1 / torque:.0f}'] = (found, False)
+        found = stabilise_transversely(planes, ROBOT, WEIGHTS[name])
+        ways[f'transverse, {method}, weights: {name}'] = (found, False)
     rows = []
     for name, (found, by_clock) in ways.items():
         shares = []

@@ -7,7 +7,8 @@ between planes turn, and where they turn they meet: at the distance
 
     r = n'x0' / |n_s|   in the plane, in units of the states                          (TUBE)
 
-from the motion. The widest surfaces make the least r as large as it can be.
+from the motion. Nor does the phase of a robot advance anywhere: up to r = n'x0' / |A'n| it does,
+to first order. The widest surfaces make the least of both radii large, (WIDE).
 """
 
 import math
@@ -89,7 +90,7 @@ def with_surfaces(
     Args:
         trajectory: Any; on ground of the slope that its provenance states.
         model: The one it was planned for.
-        method: 'widest': the least radius (TUBE) as large as it can be, impact surfaces at the
+        method: 'widest': the radii (TUBE) as large as they can be, impact surfaces at the
             ends; 'flow': normal to the motion in the metric of `units`, at the ends too.
         last: Normal at the very end, of any length, shape (4,), where the motion joins another
             one; None: the impact surface if both feet are on the ground there, else free.
@@ -192,8 +193,7 @@ def phase_of(phase: Phase, x: np.ndarray, near: float) -> float:
         change = states[k + 1] - states[k]
         # As `between` has it, written so that x0(s) costs little.
         state = states[k] + late * (
-            late * (1 + 2 * early) * change
-            + h * early * (early * rates[k] - late * rates[k + 1])
+            late * (1 + 2 * early) * change + h * early * (early * rates[k] - late * rates[k + 1])
         )
         rate = (
             6 * late * early / h * change

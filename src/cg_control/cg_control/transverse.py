@@ -39,6 +39,8 @@ from cg_control.tvlqr import (
 )
 from cg_dynamics.model import Model
 
+# The balance controller's weights throw the swing leg away: its rate costs next to nothing there.
+WALKING = Weights(swing_rate=1.0, torque=1 / 100)
 SWEEPS = 200  # round the orbit, after which its Riccati equation is said not to converge
 CONVERGED = 1e-10  # of the largest cost to go, from sweep to sweep
 
@@ -104,7 +106,7 @@ def stabilise_transversely(
     Args:
         trajectory: With surfaces. A periodic one gets the cost to go that repeats itself.
         model: The one it was planned for.
-        weights: Of deviations in the surface, with those of a leg that stands or swings.
+        weights: Of deviations in the surface; None takes WALKING.
         final_cost: Of deviations at the end of a motion that is not periodic, shape (4, 4), such
             as the cost to go of the orbit there; None: `weights.final` times that of
             `balance_regulator` on the last leg.
@@ -114,7 +116,7 @@ def stabilise_transversely(
         TrajectoryError: for another model's trajectory, or one without surfaces.
     """
     trajectory.require_model(model)
-    weights = weights or Weights()
+    weights = weights or WALKING
     design = design_of(trajectory, model)
     pieces = [_pieces(design, phase, weights) for phase in trajectory.phases]
     if not any(piece.frame is not None for of_phase in pieces for piece in of_phase):

@@ -115,8 +115,9 @@ def test_the_worst_direction_ends_the_phase(surfaces, robot):
 
 def test_phase_advances_up_to_its_radius(surfaces, robot):
     """To first order by construction; the exact model keeps it to half of that."""
-    from cg_control.surfaces import design_of
     from exact_motion import rates
+
+    from cg_control.surfaces import design_of
 
     design, rng = design_of(surfaces, robot), np.random.default_rng(2)
     for phase, radii in zip(surfaces.phases, tube(surfaces, robot), strict=True):

@@ -15,7 +15,9 @@ from cg_control.collocation import Options, optimise, planning_model
 from cg_control.orbit import plan_orbit
 from cg_control.surfaces import UNITS, between, design_of, phase_of, with_surfaces
 from cg_control.task import Box, Task
+from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import (
+    WALKING,
     UnstableError,
     frame,
     monodromy,
@@ -23,8 +25,7 @@ from cg_control.transverse import (
     stabilise_transversely,
     transverse_linearisation,
 )
-from cg_control.trajectory import TrajectoryError
-from cg_control.tvlqr import GAUSS, Weights, exponentials, jump_matrix, magnus, stabilise
+from cg_control.tvlqr import GAUSS, exponentials, jump_matrix, magnus, stabilise
 from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact
 
@@ -211,7 +212,7 @@ def test_gains_do_not_see_deviations_along_the_motion(orbit):
 
 def test_cost_to_go_repeats_itself_and_is_what_a_period_costs(fine, walker):
     """z'Pz at the start is the cost of a period plus z'Pz at its end, in the linear closed loop."""
-    design, Q, R = design_of(fine, walker), Weights(), Weights().R[0, 0]
+    design, Q, R = design_of(fine, walker), WALKING, WALKING.R[0, 0]
     start = fine.phases[0]
     E = frame(start.normals[0])
     before = E.T @ start.cost_to_go[0] @ E
@@ -298,7 +299,7 @@ def test_a_step_in_ends_on_the_orbit(orbit, walker):
 
 
 def test_where_there_are_no_surfaces_it_is_tvlqr(orbit, walker):
-    """Up to where the planes begin the cost to go is the one over time, from that of the planes."""
+    """Up to where planes begin the cost to go is the one over time, from that of the planes."""
     phase = orbit.phases[0]
     normals = np.array(phase.normals)
     normals[:9] = 0.0
@@ -307,11 +308,16 @@ def test_where_there_are_no_surfaces_it_is_tvlqr(orbit, walker):
     (found,) = stabilise_transversely(one, walker, final_cost=phase.cost_to_go[-1]).phases
     np.testing.assert_allclose(found.cost_to_go[9:], phase.cost_to_go[9:],
                                atol=1e-6 * np.abs(phase.cost_to_go).max())  # fmt: skip
-    early = replace(phase, **{
-        name: getattr(phase, name)[:10]
-        for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go', 'normals')
-    })
-    plain = stabilise(replace(one, phases=(early,)), walker, final_cost=found.cost_to_go[9])
+    early = replace(
+        phase,
+        **{
+            name: getattr(phase, name)[:10]
+            for name in ('time', 'states', 'rates', 'torque', 'gains', 'cost_to_go', 'normals')
+        },
+    )
+    plain = stabilise(
+        replace(one, phases=(early,)), walker, WALKING, final_cost=found.cost_to_go[9]
+    )
     # There friction that is not dry takes part, here nothing that is compensated.
     np.testing.assert_allclose(found.cost_to_go[:10], plain.phases[0].cost_to_go,
                                atol=0.02 * np.abs(found.cost_to_go[:10]).max())  # fmt: skip
