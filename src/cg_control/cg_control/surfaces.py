@@ -25,7 +25,7 @@ from cg_dynamics.model import Model
 
 # Deviations that weigh alike: 0.1 rad and 0.3 rad/s, as in the planner.
 UNITS = np.array([0.1, 0.1, 0.3, 0.3])
-TORQUE = 10.0  # N m that weigh as much
+TORQUE = 40.0  # N m that weigh as much: what the motor gives
 IMPACT = np.array([1.0, 1.0, 0.0, 0.0])  # gradient of the impact surface on even ground
 METHODS = ('widest', 'flow')
 SLOW = 1.0  # units per second, below which a motion has no direction that a plane could follow
@@ -80,6 +80,7 @@ def with_surfaces(
     method: str = 'widest',
     last: np.ndarray | None = None,
     units: np.ndarray = UNITS,
+    torque: float = TORQUE,
 ) -> Trajectory:
     """The trajectory with normals at its knots.
 
@@ -95,6 +96,8 @@ def with_surfaces(
         last: Normal at the very end, of any length, shape (4,), where the motion joins another
             one; None: the impact surface if both feet are on the ground there, else free.
         units: Deviations that weigh alike, shape (4,), rad and rad/s.
+        torque: Off the nominal one that weighs as much, N m; less of it for a motion that begins
+            at rest, where torque is what moves the robot.
 
     Raises:
         TrajectoryError: if the motion does not cross a surface that is given, or no planes
@@ -117,7 +120,7 @@ def with_surfaces(
                 ends[0] if first == 0 else None,
                 ends[1] if end == len(phase.time) - 1 else None,
             )
-            normals[part] = _normals(design, phase, part, method, given, units)
+            normals[part] = _normals(design, phase, part, method, given, units, torque)
         phases.append(replace(phase, normals=normals))
     return trajectory.with_phases(tuple(phases), surfaces=method)
 
@@ -130,10 +133,12 @@ class Tube:
         well_posed: Up to here every state of the surface lies on no other one near it, shape (n,).
         advancing: Up to here its phase advances under the nominal torque, n'f > 0, to first
             order, shape (n,).
+        torque: Up to so much off the nominal one it advances on the motion itself, N m, (n,).
     """
 
     well_posed: np.ndarray
     advancing: np.ndarray
+    torque: np.ndarray
 
 
 def tube(trajectory: Trajectory, model: Model, units: np.ndarray = UNITS) -> tuple[Tube, ...]:
@@ -147,7 +152,7 @@ def tube(trajectory: Trajectory, model: Model, units: np.ndarray = UNITS) -> tup
     design = design_of(trajectory, model)
     tubes = []
     for phase in trajectory.phases:
-        well_posed, advancing = np.full((2, len(phase.time)), math.inf)
+        well_posed, advancing, torque = np.full((3, len(phase.time)), math.inf)
         for first, last in with_planes(phase):
             for share, shift in ((0.0, 0), (0.5, 0), (0.5, 1), (1.0, 1)):
                 points = between(phase, share).cut(slice(first, last))
@@ -155,11 +160,13 @@ def tube(trajectory: Trajectory, model: Model, units: np.ndarray = UNITS) -> tup
                 radii = _radius(points.normals, points.rates, points.turning, units)
                 well_posed[at] = np.minimum(well_posed[at], radii)
             part = slice(first, last + 1)
-            A, _ = linearised(design, phase.stance, phase.states[part], phase.torque[part])
+            A, B = linearised(design, phase.stance, phase.states[part], phase.torque[part])
             normals = phase.normals[part]
             pulled = np.einsum('kji,kj->ki', A, normals)
             advancing[part] = _radius(normals, phase.rates[part], pulled, units)
-        tubes.append(Tube(well_posed, advancing))
+            with np.errstate(divide='ignore'):
+                torque[part] = 1 / np.abs((normals * B[:, :, 0]).sum(axis=1))
+        tubes.append(Tube(well_posed, advancing, torque))
     return tuple(tubes)
 
 
@@ -243,7 +250,7 @@ def _runs(yes: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2) if b - a >= 2]
 
 
-def _normals(design, phase, part, method, given, units) -> np.ndarray:
+def _normals(design, phase, part, method, given, units, torque) -> np.ndarray:
     """Normals (n, 4) of one stretch, n'x0' = 1 at each knot."""
     flow = phase.rates[part] / units
     if method == 'flow':
@@ -258,7 +265,7 @@ def _normals(design, phase, part, method, given, units) -> np.ndarray:
                 )
         A, B = linearised(design, phase.stance, phase.states[part], phase.torque[part])
         y = Widest(
-            phase.time[part], flow, A * units / units[:, None], B[:, :, 0] * TORQUE / units, ends
+            phase.time[part], flow, A * units / units[:, None], B[:, :, 0] * torque / units, ends
         ).solve()
     normals = y / units
     return normals / (normals * phase.rates[part]).sum(axis=1, keepdims=True)

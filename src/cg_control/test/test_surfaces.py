@@ -9,6 +9,7 @@ from cg_control.collocation import Options, optimise
 from cg_control.orbit import plan_orbit
 from cg_control.surfaces import (
     IMPACT,
+    TORQUE,
     UNITS,
     between,
     phase_of,
@@ -45,7 +46,7 @@ def test_ends_are_the_impact_surface(surfaces, robot):
             for state in x:
                 reach, rise = swing_foot(state, phase.stance, l)
                 assert abs(rise + reach * np.tan(SLOPE)) < 1e-9
-            # Crossed upward: after an impact the foot behind lifts, before one it comes down ahead.
+            # Crossed upward: after an impact the foot behind lifts, before one it lands ahead.
             reach, rise = swing_foot(x0 + 1e-5 * phase.rates[end], phase.stance, l)
             height = rise + reach * np.tan(SLOPE)
             assert phase.rates[end] @ IMPACT > 0
@@ -146,7 +147,11 @@ def test_widest_is_wider_than_a_blend(gait, surfaces, robot):
     blended = gait.with_phases(tuple(blended))
 
     def least(motion):
-        return min(min(t.well_posed.min(), t.advancing.min()) for t in tube(motion, robot))
+        both = [np.hypot(1 / t.advancing, TORQUE / t.torque) for t in tube(motion, robot)]
+        return min(
+            min(t.well_posed.min(), 1 / size.max())
+            for t, size in zip(tube(motion, robot), both, strict=True)
+        )
 
     assert least(surfaces) > 1.1 * least(blended)
 
@@ -191,7 +196,9 @@ def test_a_step_in_from_rest(gait, robot):
     """It begins with no rate, and ends on the impact surface of the orbit."""
     goal = Box.point(gait.phases[1].states[-1])
     task = Task(('outer',), goal=goal, durations=(0.2, 2.0), slope=SLOPE)
-    motion = with_surfaces(optimise(robot, task, Options(fine=20), friction=False), robot)
+    motion = with_surfaces(
+        optimise(robot, task, Options(fine=20), friction=False), robot, torque=10.0
+    )
     (phase,) = motion.phases
     np.testing.assert_allclose(
         phase.normals[-1] / np.linalg.norm(phase.normals[-1]), IMPACT / np.sqrt(2), atol=1e-9

@@ -211,7 +211,7 @@ def test_gains_do_not_see_deviations_along_the_motion(orbit):
 
 
 def test_cost_to_go_repeats_itself_and_is_what_a_period_costs(fine, walker):
-    """z'Pz at the start is the cost of a period plus z'Pz at its end, in the linear closed loop."""
+    """z'Pz at the start is what a period costs plus z'Pz at its end, in the linear closed loop."""
     design, Q, R = design_of(fine, walker), WALKING, WALKING.R[0, 0]
     start = fine.phases[0]
     E = frame(start.normals[0])
