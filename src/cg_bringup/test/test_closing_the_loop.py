@@ -23,8 +23,11 @@ from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
 from cg_sysid.rehearse import rehearse
 
+# One process makes the models for all of these tests.
+pytestmark = pytest.mark.xdist_group('closing_the_loop')
+
 PROGRAMME = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed') * 2
-DURATION, T = 5.0, 0.002
+DURATION, T = 3.0, 0.002
 EPSILON = 0.2  # s, an observer that trusts its model
 SETTLED = round(1.0 / T)  # samples: five epsilon
 CANDIDATES = ('payload', 'torque_constant', 'torque_bias', 'spring_stiffness')

@@ -29,6 +29,9 @@ from cg_sysid.parallel import run_all
 
 distributed = pytest.importorskip('distributed', reason='the cluster part is not installed')
 
+# One scheduler and its workers serve all of these tests.
+pytestmark = pytest.mark.xdist_group('cluster')
+
 EFFECTS = ('torque_bias', 'quadratic_friction', 'torque_constant')
 
 

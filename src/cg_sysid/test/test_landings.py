@@ -32,6 +32,9 @@ from cg_sysid.report.landings import landings as card
 from cg_sysid.report.wording import lead
 from cg_sysid.trial import noise_floor
 
+# One process makes the walks for all of these tests.
+pytestmark = pytest.mark.xdist_group('landings')
+
 MODEL = model_path('compass_gait_mit')
 FEW = ('impact_restitution', 'foot_slip', 'torque_bias', 'payload')
 
