@@ -1,5 +1,6 @@
 """The runners as their users meet them: what they say at the end, and what a kill leaves."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -19,9 +20,8 @@ from cg_bringup import balance_run, rebalance_run, recover_run  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.ros import MACHINE_QOS  # noqa: E402
 
-pytestmark = pytest.mark.alone
-
 PATIENCE = 60.0  # s for start-up on a busy machine
+PROMISED = 2.0  # s in which nothing is left of a runner that was killed
 RUNNERS = {
     'balance': ['cg_bringup.balance_run', '--lean', '0'],
     'rebalance': ['cg_bringup.rebalance_run', '--start-after', '0', '--duration', '0'],
@@ -59,6 +59,32 @@ def alive(pid):
     return found is not None and found[0] != 'Z'
 
 
+def waited(pid):
+    """Time in s for which the threads of a process were ready and had no core."""
+    total = 0
+    for task in Path(f'/proc/{pid}/task').glob('*/schedstat'):
+        with contextlib.suppress(OSError):  # it has just ended
+            total += int(task.read_text().split()[1])
+    return 1e-9 * total
+
+
+def gone_within(seconds, family, spin):
+    """Whether all processes end in this time, less that for which a busy machine held them up.
+
+    Those that take nothing of the processor, because they wait for something else, have no more.
+    """
+    watched = [os.getpid(), *family]
+    began, before = time.monotonic(), {pid: waited(pid) for pid in watched}
+    held_up = dict.fromkeys(watched, 0.0)
+    while any(map(alive, family)):
+        for pid in watched:
+            held_up[pid] = max(held_up[pid], waited(pid) - before[pid])
+        if time.monotonic() - began > seconds + sum(held_up.values()):
+            return False
+        spin()
+    return True
+
+
 class Ear:
     """Hears what the drive has applied."""
 
@@ -70,11 +96,14 @@ class Ear:
         self.executor = EventsExecutor()
         self.executor.add_node(self.node)
 
-    def until(self, condition, patience=PATIENCE):
+    def spin(self):
+        self.executor.spin_once(timeout_sec=0.005)
+
+    def until(self, condition):
         """Whether the condition came true in time."""
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + PATIENCE
         while not condition() and time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.005)
+            self.spin()
         return condition()
 
 
@@ -92,15 +121,15 @@ def ear():
 @pytest.mark.parametrize(
     ('runner', 'mode', 'number'),
     [
-        ('balance', 'real_time', signal.SIGTERM),
+        pytest.param('balance', 'real_time', signal.SIGTERM, marks=pytest.mark.alone),
         ('balance', 'lockstep', signal.SIGHUP),
-        ('balance', 'real_time', signal.SIGKILL),
+        pytest.param('balance', 'real_time', signal.SIGKILL, marks=pytest.mark.alone),
         ('rebalance', 'lockstep', signal.SIGKILL),
         ('recover', 'lockstep', signal.SIGTERM),
         ('experiment', 'lockstep', signal.SIGTERM),
-        ('experiment', 'real_time', signal.SIGHUP),
+        pytest.param('experiment', 'real_time', signal.SIGHUP, marks=pytest.mark.alone),
         ('experiment', 'lockstep', signal.SIGINT),
-        ('experiment', 'real_time', signal.SIGKILL),
+        pytest.param('experiment', 'real_time', signal.SIGKILL, marks=pytest.mark.alone),
     ],
 )
 def test_nothing_is_left_of_a_runner_that_is_killed(ear, tmp_path, runner, mode, number):
@@ -116,9 +145,9 @@ def test_nothing_is_left_of_a_runner_that_is_killed(ear, tmp_path, runner, mode,
             family = descendants(process.pid)
             assert len(family) >= 3
             process.send_signal(number)
-            # Two seconds are promised for SIGKILL; otherwise each node has its time to end in.
-            patience = 2.0 if number == signal.SIGKILL else PATIENCE
-            assert ear.until(lambda: not any(map(alive, family)), patience)
+            # When it is told to end, each node has its time to end in.
+            patience = PROMISED if number == signal.SIGKILL else PATIENCE
+            assert gone_within(patience, family, ear.spin)
             status = process.wait(PATIENCE)
         finally:
             for pid in filter(alive, [process.pid, *family]):
@@ -127,8 +156,7 @@ def test_nothing_is_left_of_a_runner_that_is_killed(ear, tmp_path, runner, mode,
     said = (tmp_path / 'log').read_text()
     assert status == (-number if number == signal.SIGKILL else 128 + number), said
     assert 'Traceback' not in said
-    ear.until(lambda: ear.torques[-1] == 0.0, 1.0)
-    assert ear.torques[-1] == 0.0
+    assert ear.until(lambda: ear.torques[-1] == 0.0)
     if runner == 'experiment':
         assert (tmp_path / 'legs_tied_seed1' / 'metadata.yaml').is_file()
     elif number != signal.SIGKILL:
@@ -150,10 +178,8 @@ def test_nothing_is_left_of_a_demonstration_that_is_killed(tmp_path, number):
             time.sleep(0.02)
             family = descendants(process.pid)
         process.send_signal(number)
-        deadline = time.monotonic() + (2.0 if number == signal.SIGKILL else PATIENCE)
-        while any(map(alive, family)) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert not any(map(alive, family))
+        patience = PROMISED if number == signal.SIGKILL else PATIENCE
+        assert gone_within(patience, family, lambda: time.sleep(0.01))
     finally:
         for pid in filter(alive, [process.pid, *family]):
             os.kill(pid, signal.SIGKILL)
