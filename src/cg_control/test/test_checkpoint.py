@@ -22,10 +22,13 @@ from cg_description.paths import model_path
 from cg_dynamics.c_compiler import compiler
 from cg_dynamics.model import Model
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
+pytestmark = [
+    pytest.mark.skipif(compiler() is None, reason='thousands of rollouts'),
+    pytest.mark.xdist_group('checkpoint'),
+]
 
 LONG = 120.0  # s; whatever takes longer hangs
-SAMPLES, SEED = 6 * ROUND, 5
+SAMPLES, SEED = 4 * ROUND, 5
 OPTIONS = GrowthOptions(seed=SEED, round_size=ROUND, at_once=16)
 
 
@@ -216,7 +219,7 @@ def written_anew(path, before, process) -> bytes:
 def test_growth_that_is_killed_again_and_again_ends_as_in_one_go(robot, in_one_go, tmp_path):
     out, part = tmp_path / 'tree.npz', tmp_path / 'tree.npz.part'
     words = ['--samples', str(SAMPLES), '--seed', str(SEED), '--workers', '2', '--out', str(out)]
-    instants, before, done = np.random.default_rng(8).uniform(0.0, 0.6, 3), b'', []
+    instants, before, done = np.random.default_rng(8).uniform(0.0, 0.6, 2), b'', []
     for instant in instants:
         process = started(tmp_path, *words)
         written_anew(part, before, process)

@@ -1,6 +1,7 @@
 """Planning by workers: as here, and when some of them hang or die."""
 
 import os
+import pickle
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,6 +18,7 @@ from cg_dynamics.watched_processes import WatchedProcesses
 REGION = Region(np.array(BOX))
 OPTIONS = GrowthOptions(seed=2, round_size=ROUND)
 NEVER = 10_000.0  # s
+SOON, LONG = 0.5, 60.0  # s
 
 
 class Failing(WatchedProcesses):
@@ -26,8 +28,8 @@ class Failing(WatchedProcesses):
         instead: Function and argument, by number of the piece.
     """
 
-    def __init__(self, count, limit, instead):
-        super().__init__(count, limit)
+    def __init__(self, count, instead):
+        super().__init__(count, LONG)
         self.instead, self.number = instead, 0
 
     def submit(self, function, /, *arguments):
@@ -35,6 +37,11 @@ class Failing(WatchedProcesses):
         if number in self.instead:
             return super().submit(*self.instead[number])
         return super().submit(function, *arguments)
+
+    def _result(self, k, call):
+        # What hangs is not waited for as long as for a process that compiles all it needs.
+        self._limit = SOON if pickle.loads(call)[0] is time.sleep else LONG
+        return super()._result(k, call)
 
 
 def same(a, b):
@@ -62,8 +69,7 @@ def test_a_planner_that_hangs_or_dies_costs_its_state_alone(robot):
     here = Extension(robot)(nodes, leg, x)
     asked = np.flatnonzero(Extension(robot).promising(leg, x) <= 1)
     instead = {1: (time.sleep, NEVER), 2: (os._exit, 3)}
-    # Long enough for all that a process compiles with its first state.
-    with Failing(1, 20.0, instead) as failing:
+    with Failing(1, instead) as failing:
         there = Extension(robot, executor=failing)(nodes, leg, x)
     lost = [k for k, branch in enumerate(there) if isinstance(branch, GivenUp)]
     assert lost == asked[[1, 2]].tolist()
@@ -76,7 +82,7 @@ def test_a_planner_that_hangs_or_dies_costs_its_state_alone(robot):
 
 @pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
 def test_a_tree_grows_on_without_the_states_that_were_given_up(robot):
-    with Failing(1, 20.0, {0: (os._exit, 3), 3: (os._exit, 3)}) as failing:
+    with Failing(1, {0: (os._exit, 3), 3: (os._exit, 3)}) as failing:
         grower = Grower(
             robot, upright_tree(robot), REGION, Extension(robot, executor=failing), OPTIONS,
             simulation=LANDING,
@@ -91,7 +97,7 @@ def test_a_tree_grows_on_without_the_states_that_were_given_up(robot):
 def test_an_error_of_the_planner_is_no_lost_state(robot):
     leg, x = REGION.draw(np.random.default_rng(1), 4)
     with (
-        Failing(1, 20.0, {0: (int, 'x')}) as failing,
+        Failing(1, {0: (int, 'x')}) as failing,
         pytest.raises(ValueError, match='invalid literal'),
     ):
         Extension(robot, executor=failing)(upright_tree(robot).nodes, leg, x)
