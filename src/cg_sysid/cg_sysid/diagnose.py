@@ -212,6 +212,21 @@ def led_in(trial: Trial) -> Trial:
     return replace(trial, outputs=np.where(begun[:, None], trial.outputs, np.nan))
 
 
+def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> str:
+    """The verdict on records.
+
+    Args:
+        causes: Named causes.
+        left: Whether they leave an error above the noise.
+        share: Share of the squared error above the noise that they take.
+    """
+    if not causes:
+        return 'unexplained' if left else 'consistent'
+    if left and share < ACCOUNTS:
+        return 'unexplained'
+    return 'ambiguous' if any(cause.rivals for cause in causes) else 'explained'
+
+
 class _Search:
     """State of one diagnosis: what was tried on top of what."""
 
@@ -686,14 +701,7 @@ class _Search:
         if wandering and unmodelled and unmodelled.explained > wandering.explained:
             wandering = None  # the same for all records, and more
         share = share_explained(nominal.held, final.held)
-        if not causes:
-            verdict = 'unexplained' if left else 'consistent'
-        elif left and share < ACCOUNTS:
-            verdict = 'unexplained'
-        elif any(cause.rivals for cause in causes):
-            verdict = 'ambiguous'
-        else:
-            verdict = 'explained'
+        verdict = verdict_of(causes, bool(left), share)
         gains = gains_of(self.nominal, self.held, nominal.held, final.held)
         reference = self.jury.judge(nominal, nominal, 0.0)
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnose import diagnose, verdict_of
 from cg_sysid.diagnosis import Cause, Gain, Options, contains, summary_of
 from cg_sysid.rehearse import rehearse
 
@@ -20,6 +21,30 @@ def test_a_ratio_is_printed_without_a_unit_and_a_torque_with_its_own():
     text = summary_of('explained', causes, (gain,), {})
     assert 'imu_scale (scale = 1.02 +- 0.001)' in text
     assert 'torque_bias (torque = 0.8 +- 0.01 N m)' in text
+
+
+@pytest.mark.parametrize(
+    ('rivals', 'left', 'share', 'verdict'),
+    [
+        (None, False, 0.0, 'consistent'),
+        (None, True, 0.0, 'unexplained'),
+        ((), False, 0.4, 'explained'),
+        ((), True, 0.6, 'explained'),
+        ((), True, 0.4, 'unexplained'),
+        (('back_emf',), False, 1.0, 'ambiguous'),
+        (('back_emf',), True, 0.4, 'unexplained'),
+    ],
+)
+def test_what_takes_less_than_half_of_the_error_is_no_explanation(rivals, left, share, verdict):
+    """In a whole diagnosis: test_unmodelled.py, among the evidence."""
+    values = {'error': (-0.1, 0.02, '1')}
+    causes = [] if rivals is None else [Cause('torque_constant', values, 50.0, rivals)]
+    assert verdict_of(causes, left, share) == verdict
+    gain = Gain('hip_angle', 'rad', 1e-2, 7e-3, 1e-4)
+    remaining = {'hip_angle': 70.0} if left else {}
+    text = summary_of(verdict, causes, (gain,), remaining, explained=share)
+    assert ('may only stand in' in text) == bool(verdict == 'unexplained' and causes)
+    assert ('No more than 40 % of the squared error' in text) == ('stand in' in text)
 
 
 def test_a_record_that_holds_most_of_the_error_is_a_finding(model_file):

@@ -78,7 +78,7 @@ def test_unlisted_effect_is_described(nominal, case):
     assert all(name in answer.summary for name in case.listed)
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     # The torque constant takes a third of what a law with a memory does, on held-out records too.
     case = next(case for case in MORE if case.hidden is ViscoelasticHip)
