@@ -146,8 +146,8 @@ def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):
     assert set(late) == {0.0}
 
 
-def changes(run, count):
-    """Change a weight so many times; reports of the controller before and meanwhile."""
+def changes(run, count, samples=15):
+    """Change a weight every so many samples; reports of the controller before and meanwhile."""
     client = run.node.create_client(SetParameters, '/balance/set_parameters')
     run.until(lambda: client.service_is_ready() and len(run.applied) > 500)
     run.until(lambda: len(run.reports) > 3)
@@ -160,7 +160,7 @@ def changes(run, count):
         future = client.call_async(request)
         run.until(future.done)
         assert future.result().results[0].successful
-        count = len(run.applied) + 15
+        count = len(run.applied) + samples
         run.until(lambda count=count: len(run.applied) >= count)
     reports = len(run.reports)
     run.until(lambda: len(run.reports) > reports + 1)
@@ -170,7 +170,7 @@ def changes(run, count):
 @pytest.mark.slow
 def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
     run = loop(mode='lockstep', stance='inner', lean=0.03)
-    _, reports = changes(run, 200)
+    _, reports = changes(run, 200, samples=5)
     assert {text for text, _ in reports} == {'balancing'}
     # It never lets go: zero torque twice in a row is what an idle controller sends.
     torques = [torque for _, torque in run.applied[500:]]

@@ -33,22 +33,24 @@ PROGRAMME = (
 SPRINGS = ('spring_stabilised_inner', 'spring_stabilised_outer') * 2
 SWINGS = ('swing_inner_fixed', 'swing_outer_fixed') * 2
 DURATION = 6.0  # s
+SHORT = 4.0  # s, enough for what acts all the time
 
-# Effect and seed, and what comes nearest to it: where it is not given, the whole library is tried.
-# Others are hidden in MuJoCo's robot in cg_sysid, all in the benches.
+# Effect and seed, what comes nearest to it (where it is not given, the whole library is tried),
+# and what is recorded: what is wrong at the hip shows where a leg swings, and that is quickly
+# simulated. Others are hidden in MuJoCo's robot in cg_sysid, all in the benches.
 FRICTIONS = (
     'coulomb_friction', 'viscous_friction', 'quadratic_friction', 'asymmetric_friction',
     'load_dependent_friction', 'presliding_friction',
 )  # fmt: skip
 HIDDEN = (
-    ('actuator_lag', 12, None),
-    ('stribeck_friction', 17, ('stribeck_friction', *FRICTIONS)),
+    ('actuator_lag', 12, None, SWINGS[::2], SHORT),
+    ('stribeck_friction', 17, ('stribeck_friction', *FRICTIONS), SWINGS, DURATION),
     (
         'backlash', 20,
-        ('backlash', 'joint_flexibility', 'actuator_delay', 'encoder_eccentricity'),
+        ('backlash', 'joint_flexibility', 'actuator_delay', 'encoder_eccentricity'), SWINGS, SHORT,
     ),
     *(
-        pytest.param(effect, seed, None, marks=pytest.mark.evidence)
+        pytest.param(effect, seed, None, PROGRAMME, DURATION, marks=pytest.mark.evidence)
         for effect, seed in (
             ('stribeck_friction', 17), ('backlash', 20), ('coulomb_friction', 15),
             ('encoder_offset', 23), ('imu_offset', 24),
@@ -57,13 +59,13 @@ HIDDEN = (
 )  # fmt: skip
 
 
-def recorded(machine, seed, directory, programme=PROGRAMME):
+def recorded(machine, seed, directory, programme=PROGRAMME, duration=DURATION):
     """Records of the programme on a machine, through bags on disk."""
     records = []
     for index, name in enumerate(programme):
         experiment = load_experiment(name)
         settings = ExcitationSettings(
-            **experiment.excitation, duration=DURATION, seed=100 * seed + index
+            **experiment.excitation, duration=duration, seed=100 * seed + index
         )
         record = rehearse(
             f'{index}_{name}',
@@ -71,7 +73,7 @@ def recorded(machine, seed, directory, programme=PROGRAMME):
             experiment.setup,
             experiment.initial_state,
             [make_signal(settings)],
-            DURATION,
+            duration,
             seed=1000 * seed + index,
         )
         records.append(read_bag(write_bag(directory / record.name, record)))
@@ -79,12 +81,13 @@ def recorded(machine, seed, directory, programme=PROGRAMME):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('effect', 'seed', 'candidates'), HIDDEN)
-def test_a_hidden_effect_is_named_and_its_gain_measured(effect, seed, candidates, tmp_path):
+@pytest.mark.parametrize(('effect', 'seed', 'candidates', 'programme', 'duration'), HIDDEN)
+def test_a_hidden_effect_is_named_and_its_gain_measured(
+    effect, seed, candidates, programme, duration, tmp_path
+):
     hidden = hide(Model.load(model_path(NOMINAL_MODEL)), effect, seed)
-    # What is wrong at the hip shows where a leg swings, and that is quickly simulated.
-    records = recorded(hidden.model, seed, tmp_path, SWINGS if candidates else PROGRAMME)
-    found = diagnose(hidden.nominal, records, Options(effects=candidates, workers=2))
+    records = recorded(hidden.model, seed, tmp_path, programme, duration)
+    found = diagnose(hidden.nominal, records, Options(effects=candidates, workers=1))
 
     named = {cause.label.partition('@')[0] for cause in found.causes}
     rivals = {rival.partition('@')[0] for cause in found.causes for rival in cause.rivals}
@@ -107,24 +110,25 @@ def test_a_hidden_effect_is_named_and_its_gain_measured(effect, seed, candidates
 def test_nothing_hidden_is_consistent(seed, tmp_path):
     nominal = Model.load(model_path(NOMINAL_MODEL))
     machine, _ = perturb(nominal, np.random.default_rng(seed))
-    found = diagnose(nominal, recorded(machine, seed, tmp_path), Options(workers=2))
+    records = recorded(machine, seed, tmp_path, duration=SHORT)
+    found = diagnose(nominal, records, Options(workers=1))
     assert found.verdict == 'consistent', found.summary
     assert not found.causes
 
 
 @pytest.mark.parametrize(
-    ('effect', 'programme'),
+    ('effect', 'programme', 'duration'),
     [
-        ('external_push', SPRINGS),
-        ('friction_drift', SWINGS),
-        ('imu_drift', SWINGS),
-        ('tether_force', SPRINGS),
+        ('external_push', SPRINGS, DURATION),
+        ('friction_drift', SWINGS, SHORT),
+        ('imu_drift', SWINGS, SHORT),
+        ('tether_force', SPRINGS, SHORT),
     ],
 )
-def test_the_command_line_tells_of_every_kind_of_effect(effect, programme, tmp_path):
+def test_the_command_line_tells_of_every_kind_of_effect(effect, programme, duration, tmp_path):
     """Values of a record's own, laws of the time, ties with small faults: up to the report."""
     hidden = hide(Model.load(model_path(NOMINAL_MODEL)), effect, 61)
-    records = recorded(hidden.model, 61, tmp_path, programme)
+    records = recorded(hidden.model, 61, tmp_path, programme, duration)
     bags = [str(tmp_path / record.name) for record in records]
     nominal, out = tmp_path / 'nominal.yaml', tmp_path / 'answer'
     hidden.nominal.save(nominal)
@@ -144,7 +148,7 @@ def test_small_faults_that_came_first_hide_no_second_effect(tmp_path):
     machine, _ = perturb(nominal, np.random.default_rng(2103))
     for name, values in hidden.items():
         machine = machine.with_effect(name, None, **values)
-    options = Options(effects=(*hidden, 'torque_bias', 'quadratic_friction'), workers=2)
-    found = diagnose(nominal, recorded(machine, 2103, tmp_path, SPRINGS), options)
+    options = Options(effects=(*hidden, 'torque_bias', 'quadratic_friction'), workers=1)
+    found = diagnose(nominal, recorded(machine, 2103, tmp_path, SPRINGS, SHORT), options)
     assert {cause.label for cause in found.causes} == set(hidden), found.summary
     assert found.extended.held.normalised_error < 1.1  # noise, within a few per cent

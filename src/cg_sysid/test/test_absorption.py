@@ -28,7 +28,6 @@ def springs(leg):
 
 SETUPS = (
     (Setup('inner', springs=springs('inner')), [0.1, -0.1, 0.5, -1.0]),
-    (Setup('outer', springs=springs('outer')), [0.1, -0.1, -0.8, 0.5]),
     (Setup('inner', fixture='inner_fixed'), [0.2, 0.5]),
 ) * 2
 

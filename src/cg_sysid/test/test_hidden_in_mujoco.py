@@ -107,7 +107,7 @@ def test_an_effect_hidden_in_mujoco_is_named(effect, candidates):
         **HIDDEN[effect],
     )
     records = [record(name, truth, hidden, 10 * seed + i) for i in range(2) for name in SETUPS]
-    found = diagnose(nominal, records, Options(effects=candidates, workers=2))
+    found = diagnose(nominal, records, Options(effects=candidates, workers=1))
     named = {cause.label.partition('@')[0] for cause in found.causes}
     if effect == 'none':
         assert found.verdict == 'consistent', found.summary

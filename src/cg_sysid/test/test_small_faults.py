@@ -27,18 +27,18 @@ def _springs(stiffness):
     return Setup(springs=tuple(pair))
 
 
-def _records(machine):
+def _records(machine, duration=4.0):
     """Four records on springs 1 % stiffer than their notes say."""
-    return _records_on(machine, _springs(202.0))
+    return _records_on(machine, _springs(202.0), duration)
 
 
-def _records_on(machine, setup):
+def _records_on(machine, setup, duration=4.0):
     found = []
     for k in range(4):
         record = rehearse(
             f'record_{k}', machine, setup, [0.1 - 0.07 * k, -0.1, 0.3, -0.5],
             [lambda t, k=k: 9.0 * math.sin(2 * math.pi * (0.4 + 0.1 * k + 0.15 * t) * t)],
-            5.0, 0.004, k,
+            duration, 0.004, k,
         )  # fmt: skip
         found.append(replace(record, setup=_springs(200.0)))
     return found
@@ -112,7 +112,7 @@ def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
 def test_what_hides_behind_small_faults_and_is_small_itself_is_no_cause(nominal):
     machine = nominal.with_effect('actuator_delay', delay=0.001)
     machine = machine.with_effect('quadratic_friction', coefficient=0.006)
-    found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
+    found = diagnose(nominal, _records(machine, 5.0), Options(effects=EFFECTS, workers=1))
     # Nor is the delay, or a lag that looks like it: that small it is a small fault.
     assert (found.verdict, found.causes) == ('consistent', ())
     reasons = [c.reason for r in found.rounds for c in r.candidates
@@ -201,7 +201,7 @@ def test_small_faults_stay_within_their_bounds(nominal):
 def test_other_starts_of_a_cause_have_the_unknowns_of_its_fit(nominal):
     """A friction with a smoothing of its own, which is a small fault even where it is a cause."""
     machine = nominal.with_effect('asymmetric_friction', excess=0.3)
-    trials = prepare(nominal, _records(machine)[:2])
+    trials = prepare(nominal, _records(machine, 5.0)[:2])
     effect = ('asymmetric_friction', None)
     model, bounds = with_imperfections(nominal.with_effect(*effect), [_springs(200.0)])
     assert 'asymmetric_friction.transition_rate' in bounds
