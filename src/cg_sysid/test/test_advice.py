@@ -30,7 +30,7 @@ def test_the_proposed_experiment_settles_what_is_ambiguous(model_file):
     nominal = Model.load(model_file)
     machine = nominal.with_values({'c1': 1.1 * nominal.values['c1']})
     machine = machine.with_effect('ankle_friction', coefficient=0.8)
-    records = [_record(machine, 'spring_stabilised_inner', seed, 6.0) for seed in (1, 2)]
+    records = [_record(machine, 'spring_stabilised_inner', seed, 4.0) for seed in (1, 2)]
     options = Options(effects=EFFECTS, workers=1, experiments=tuple(experiments_for(nominal)))
     first = diagnose(nominal, records, options)
     assert first.verdict == 'ambiguous'

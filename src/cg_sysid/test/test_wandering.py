@@ -33,7 +33,7 @@ def _session(machines):
         rehearse(
             f'take_{k}', machine, SETUP, [0.1 - 0.05 * k, -0.1, 0.3, -0.5],
             [lambda t, k=k: 8.0 * math.sin(2 * math.pi * (0.4 + 0.1 * k + 0.15 * t) * t)],
-            5.0, 0.004, k,
+            4.0, 0.004, k,
         )
         for k, machine in enumerate(machines)
     ]  # fmt: skip
