@@ -79,7 +79,7 @@ def gone_within(seconds, family, spin):
     while any(map(alive, family)):
         for pid in watched:
             held_up[pid] = max(held_up[pid], waited(pid) - before[pid])
-        if time.monotonic() - began > seconds + sum(held_up.values()):
+        if time.monotonic() - began > min(seconds + sum(held_up.values()), PATIENCE):
             return False
         spin()
     return True
