@@ -73,6 +73,28 @@ def recovery_verdict(outcome: Outcome, pushes: Sequence[float] = ()) -> Verdict:
     return Verdict(found.worked, f'{line}{steps}')
 
 
+def walk_verdict(outcome: Outcome, steps: int) -> Verdict:
+    """Of a robot that was to walk.
+
+    Args:
+        outcome: How it fared.
+        steps: Asked for, after which it was to stand; 0: it was to walk on.
+    """
+    made, walked = outcome.stepped_at, ''
+    if len(made) > 1:
+        walked = f' from {made[0]:.2f} to {made[-1]:.2f} s'
+    line = f'{len(made)} steps{walked}'
+    if outcome.fell_at is not None or outcome.duration == 0.0:
+        return Verdict(False, f'{_lost(outcome)}, after {line}')
+    if not steps:
+        return Verdict(bool(made), f'walking to the end: {line}')
+    if not _stands(outcome):
+        return Verdict(False, f'{_lost(outcome)}, after {line}')
+    if len(made) < steps:
+        return Verdict(False, f'{line} of {steps} asked for, upright: {_length(outcome)}')
+    return Verdict(True, f'{line}, upright at the end: {_length(outcome)}')
+
+
 def _stands(outcome: Outcome) -> bool:
     return outcome.fell_at is None and outcome.last_lean < UPRIGHT and outcome.duration > 0.0
 

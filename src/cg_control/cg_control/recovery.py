@@ -172,6 +172,7 @@ class TreeController:
         entered: Node at which it went over to where it is now, -1 while none is followed.
         depth: Of the last state: in the basin while balancing, in the funnel otherwise, NaN
             where none is said (an impact is due). Inside if 1 or less.
+        demand: Speed that is wanted in place of that of the settings, m/s; None: theirs.
         steps_taken: Impacts since it was told at which speed to walk.
         switches: How often the robot has gone over to another node while it followed one.
         lookup_times: Of the last look-ups, s.
@@ -182,6 +183,7 @@ class TreeController:
         self.balance, self.settings = balance, settings
         self.mode, self.node, self.entered = IDLE, -1, -1
         self.depth, self.switches, self.steps_taken = math.inf, 0, 0
+        self.demand: float | None = None
         self.lookup_times: collections.deque[float] = collections.deque(maxlen=KEPT)
         self._ready: ReadyTree | None = None
         self.preview_times: collections.deque[float] = collections.deque(maxlen=KEPT)
@@ -206,7 +208,16 @@ class TreeController:
         made = self.settings.steps and self.steps_taken >= self.settings.steps
         if made or self._ready is None:
             return UPRIGHT
-        return self._ready.routes.home_at(self.settings.speed)
+        speed = self.settings.speed if self.demand is None else self.demand
+        return self._ready.routes.home_at(speed)
+
+    @property
+    def speed(self) -> float:
+        """Of the home that the robot is at or on its way to, m/s."""
+        if self.mode != FOLLOWING or self._ready is None:
+            return 0.0
+        nodes = self._ready.tree.nodes
+        return self._ready.routes.speed_of(int(nodes.orbit_of[self._ready.tracker.node]))
 
     @property
     def way(self) -> Way:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -70,6 +71,10 @@ class TreeControllerSettings(RecoverySettings):
         maximum=1.0,
         live=True,
     )
+    demand_timeout: float = setting(
+        1.0, 'age of a /cmd_vel after which the robot stops; 0: never', unit='s', minimum=0.0,
+        maximum=3600.0, live=True,
+    )  # fmt: skip
     await_tree: bool = setting(
         True, 'answer no state until the first tree is there; otherwise with zero torque'
     )
@@ -97,6 +102,7 @@ class TreeControllerNode(Node):
         self.problem = 'no tree selected yet'
         self._selection: TreeSelection | None = None
         self._last_ns: int | None = None
+        self._demanded_ns: int | None = None
         self._reason = 'no state yet'
         self._next_diagnosis = 0.0
         self._shown = -1
@@ -111,6 +117,7 @@ class TreeControllerNode(Node):
         self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
         self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
         self.create_subscription(String, '/tree/selected', self.on_selected, LATCHED_QOS)
+        self.create_subscription(Twist, '/cmd_vel', self.on_speed, 10)
         self.add_on_set_parameters_callback(self._judge)
         self.started = True
 
@@ -164,7 +171,9 @@ class TreeControllerNode(Node):
         if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
             self.controller.interrupt()
         self._last_ns = stamp_ns
+        self._let_demand_lapse(stamp_ns)
         if self.controller.settings is not self.declared.values:
+            self.controller.demand = self._demanded_ns = None
             self.design.adopt(self.declared.values)
             self.controller.adopt(self.declared.values)
         try:
@@ -183,6 +192,23 @@ class TreeControllerNode(Node):
         spent = time.perf_counter() - began
         self._spent.append(spent)
         self._slow += spent > 1.0 / self.declared.values.sample_rate_hz
+
+    def on_speed(self, message: Twist) -> None:
+        """A speed that is wanted, until it is too old or a parameter is set."""
+        speed = message.linear.x
+        if not math.isfinite(speed):
+            self.get_logger().error(f'/cmd_vel refused: linear.x is {speed}')
+            return
+        # It does not walk backwards: there it stands.
+        self.controller.demand, self._demanded_ns = max(speed, 0.0), self._last_ns
+
+    def _let_demand_lapse(self, stamp_ns: int) -> None:
+        """Stop where nobody says any more how fast to walk."""
+        patience = self.declared.values.demand_timeout
+        if self._demanded_ns is None or not patience:
+            return
+        if stamp_ns - self._demanded_ns > 1e9 * patience:
+            self.controller.demand = 0.0
 
     def _send(self, stamp_ns: int, torque: float) -> None:
         self.message.header.stamp = to_stamp(stamp_ns)
@@ -224,6 +250,8 @@ class TreeControllerNode(Node):
             'depth': f'{controller.depth:.4g}',
             'to_go_s': f'{controller.to_go:.3f}',
             'switches': controller.switches,
+            'speed_m_s': controller.speed,
+            'steps_taken': controller.steps_taken,
             'slow_answers': self._slow,
         }
         # A copy first: percentiles of thousands take a while.
