@@ -217,6 +217,8 @@ static void load(const struct job *job, struct lanes *l, int j, int st, struct w
     l->left[j] = w->left, l->tick[j] = w->tick, l->samples[j] = job->samples[b];
     l->strange[j] = w->tick == 0.0 || job->leg[w->node] != st ? -1 : 0;
     enter(job, l, j);
+    /* Its reference has not landed yet. */
+    if (job->leg[w->node] != st) l->orbit[j] = 0;
 }
 
 static inline __attribute__((always_inline)) void prepare(int st, const vd *p, vd *c)
@@ -365,8 +367,7 @@ static inline __attribute__((always_inline)) void run(const struct job *job, int
                 for (int i = 0, k = 0; i < NL; i++)
                     for (int j = i; j < NL; j++, k++) away += goal[k] * l.x[i] * l.x[j];
                 arrived = asks & l.upright & (away <= 1.0);
-                /* On the leg of its node: another one has not moved the reference yet. */
-                vi orbit = asks & l.orbit & ~l.strange;
+                vi orbit = asks & l.orbit;
                 if (any(orbit)) arrived |= orbit & in_tube(&l);
             }
             vd rate = job->pull > 0 ? phase_rate(job, &l) : SPLAT(1.0);

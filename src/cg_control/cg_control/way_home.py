@@ -1,4 +1,4 @@
-"""The way from a node of a tree to upright, to look at: knots, and where hip and feet go."""
+"""The way from a node of a tree to its home, to look at: knots, and where hip and feet go."""
 
 from dataclasses import dataclass
 
@@ -29,12 +29,14 @@ class WayHome:
 
     @classmethod
     def along(cls, nodes: Nodes, node: int) -> 'WayHome':
-        """The way from a node; links, which take no time, are left out."""
+        """The way from a node to rest, or once round an orbit; links, which take no time, not."""
         if not 0 <= node < len(nodes):
             raise ValueError(f'node is {node}; there are nodes 0 to {len(nodes) - 1}')
         planned, jumps = nodes.planned, nodes.impact | nodes.late
         found, time, t = [], [], 0.0
-        while node >= 0:
+        passed: set[int] = set()
+        while node >= 0 and node not in passed:
+            passed.add(node)
             if nodes.span[node] > 0:
                 found.append(node)
                 time.append(t)
