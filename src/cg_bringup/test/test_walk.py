@@ -17,7 +17,12 @@ from cg_bringup.walk_run import WalkRunOptions, walk_nodes  # noqa: E402
 from cg_control.balance import BALANCING, BalanceController, balance_gains  # noqa: E402
 from cg_control.basin import shipped_basins  # noqa: E402
 from cg_control.nodes import Way  # noqa: E402
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController  # noqa: E402
+from cg_control.recovery import (  # noqa: E402
+    OUTSIDE,
+    ReadyTree,
+    RecoverySettings,
+    TreeController,
+)
 from cg_control.tree import Tree, TreeError  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
 from cg_control.tree_files import tree_path  # noqa: E402
@@ -62,10 +67,24 @@ def walker(ready):
     return make
 
 
-def run(controller, duration, pushes=(), seed=2):
+class Uneven(Plant):
+    """A machine on ground that rises where one of its feet lands."""
+
+    rise, at, landed = 0.0, 0, 0  # m, number of the landing, landings so far
+
+    def _height(self, x):
+        return super()._height(x) - (self.rise if self.landed == self.at else 0.0)
+
+    def _stands_on(self, stance):
+        super()._stands_on(stance)
+        self.landed += 1
+
+
+def run(controller, duration, pushes=(), seed=2, robot=MODEL, rise=0.0):
     """From upright on the inner leg, with noise, quantisation and an observer."""
     setup = Setup(stance='inner', on_blocks=False)
-    plant = Plant(MODEL, setup, np.zeros(4), seed=seed)
+    plant = Uneven(robot, setup, np.zeros(4), seed=seed)
+    plant.rise, plant.at = rise, 4
     return balance(plant, HighGainObserver(MODEL, setup, 0.01), controller, duration, pushes)
 
 
@@ -93,6 +112,36 @@ def test_a_push_does_not_stop_it(walker):
     assert controller.depth <= 1.0
     at = landings(done)
     assert (np.diff(at[at > 9.0]) < 1.5).all()
+
+
+HIDDEN = {
+    'less gravity': {'robot': MODEL.with_values({'gravity': 9.5})},
+    'a payload': {'robot': MODEL.with_effect('payload', 'outer', mass=0.8, distance=0.4)},
+    'a step up': {'rise': 0.004},
+    'a step down': {'rise': -0.004},
+}
+
+
+@pytest.mark.parametrize('hidden', HIDDEN)
+def test_it_walks_on_with_what_nobody_told_it(walker, hidden):
+    controller = walker(speed=0.3, steps=6)
+    done = run(controller, 14.0, **HIDDEN[hidden])
+    assert done.upright(14.0)
+    assert len(landings(done)) >= 6
+
+
+def test_a_fall_is_told_and_ends_without_torque(walker):
+    """With 4 kg on one leg pair that it does not know of nothing brings it home."""
+    controller = walker(speed=0.3)
+    heavy = MODEL.with_effect('payload', 'inner', mass=4.0, distance=0.5)
+    done = run(controller, 16.0, robot=heavy)
+    assert done.time[-1] < 15.0  # it fell
+    assert controller.mode == OUTSIDE
+    assert (done.torque[-3:] == 0.0).all()
+    lying = np.array([1.0, *done.estimates[-1][1:]])
+    said = controller.step(round(1e9 * done.time[-1]) + 2_000_000, 'inner', lying)
+    assert said.torque == 0.0
+    assert 'leaning by 1 rad' in said.reason
 
 
 def test_a_robot_that_is_told_nothing_stands(walker):
