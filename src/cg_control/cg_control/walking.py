@@ -101,7 +101,7 @@ def tube_level(
     node = rng.choice(on, options.samples)
     low, high = np.log(options.costs)
     cost = np.exp(np.sort(rng.uniform(low, high, len(node))))
-    x = nodes.x0[node] + np.sqrt(cost)[:, None] * _across(nodes, node, rng)
+    x = nodes.x0[node] + np.sqrt(cost)[:, None] * across(nodes, node, rng)
     # Where the swing foot would be ahead and in the ground it has landed before.
     above = ~buried(x, nodes.stance[node], simulation.slope)
     node, cost, x = node[above], cost[above], x[above]
@@ -132,7 +132,7 @@ def buried(x: np.ndarray, leg: np.ndarray, slope: float = 0.0) -> np.ndarray:
     return (standing > swinging) & (standing + swinging > 2 * slope)
 
 
-def _across(nodes: Nodes, node: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def across(nodes: Nodes, node: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Deviations of cost one on the surfaces of nodes, of random direction: (m, 4)."""
     values, vectors = np.linalg.eigh(nodes.F[node])
     # Slow orbits amplify so much that rounding makes the least of the three negative.

@@ -19,7 +19,7 @@ from cg_control.tree_files import tree_path
 from cg_control.walking import (
     WALKING,
     TubeOptions,
-    _across,
+    across,
     buried,
     orbit_nodes,
     phase_starts,
@@ -81,14 +81,14 @@ def test_the_robot_walks_on_its_orbit(robot, nodes, orbit):
 def near(nodes, node, cost, seed):
     """States on the surfaces of nodes, this deep, above the ground."""
     rng = np.random.default_rng(seed)
-    x = nodes.x0[node] + np.sqrt(cost)[:, None] * _across(nodes, node, rng)
+    x = nodes.x0[node] + np.sqrt(cost)[:, None] * across(nodes, node, rng)
     above = ~buried(x, nodes.stance[node])
     return node[above], x[above]
 
 
 def test_deviations_across_cost_what_they_are_asked_to_and_keep_the_phase(nodes):
     node = np.flatnonzero(nodes.orbiting & ~nodes.impact)
-    away = _across(nodes, node, np.random.default_rng(3))
+    away = across(nodes, node, np.random.default_rng(3))
     cost = np.einsum('ni,nij,nj->n', away, nodes.F[node], away)
     np.testing.assert_allclose(cost, 1.0, rtol=1e-5)
     along = np.einsum('ni,ni->n', nodes.surfaces[node, 0], away)
