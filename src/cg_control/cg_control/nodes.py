@@ -200,7 +200,7 @@ class Nodes:
             TrajectoryError: naming the array, the node and what is allowed.
         """
         n, nx = len(self), self.x0.shape[-1]
-        tails = {'x0': (nx,), 'rates': (nx,), 'K': (nx,), 'normal': (nx,)}
+        tails: dict[str, tuple[int, ...]] = dict.fromkeys(('x0', 'rates', 'K', 'normal'), (nx,))
         tails |= {'S': (nx, nx), 'F': (nx, nx)}
         for name in ARRAYS:
             array, shape = getattr(self, name), (n, *tails.get(name, ()))
@@ -464,7 +464,7 @@ class Nodes:
         along = np.einsum('nij,nj->ni', self.F, self.rates)
         trace = np.trace(self.F, axis1=1, axis2=2)
         length = np.einsum('ni,ni->n', along, self.rates) + STILL * trace
-        designed = self.normal.any(axis=1)[:, None]
+        designed = np.asarray(self.normal.any(axis=1))[:, None]
         found = np.where(designed, self.normal, along / length[:, None])
         moves = np.isfinite(self.span) & (self.span > 0)
         then = np.where(moves, self.next, 0)

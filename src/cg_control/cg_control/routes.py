@@ -46,7 +46,7 @@ class Routes:
     speeds: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, nodes: Nodes, speeds: Sequence[float] = ()) -> 'Routes':
+    def of(cls, nodes: Nodes, speeds: Sequence[float] | np.ndarray = ()) -> 'Routes':
         """Find them.
 
         Args:
