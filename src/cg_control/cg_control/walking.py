@@ -178,7 +178,7 @@ def with_ways(
     wanted: list[tuple[int, int]] = []  # (node to leave from, home to go to)
     roots = np.flatnonzero(nodes.planned < 0)
     for orbit in range(count):
-        leaves = phase_starts(nodes, orbit)
+        leaves = nodes.phase_starts(orbit)
         if orbit == 0:
             wanted += [(int(root), orbit) for root in roots]
             wanted += [(int(node), -1) for node in leaves]
@@ -199,12 +199,6 @@ def with_ways(
     if not ways:
         raise TrajectoryError('no motion leads from any home of the tree to another')
     return replace(tree, nodes=nodes)
-
-
-def phase_starts(nodes: Nodes, orbit: int) -> np.ndarray:
-    """The nodes of an orbit to which impacts lead, right after them: shape (phases,)."""
-    on = nodes.orbiting & (nodes.orbit_of == orbit)
-    return np.unique(nodes.landing[on & nodes.impact])
 
 
 def planned(
@@ -241,7 +235,7 @@ def _ends(
             if len(roots):
                 yield modes, roots[:1], UPRIGHT
         elif impacts:
-            first = [n for n in phase_starts(nodes, onto) if nodes.stance[n] == last]
+            first = [n for n in nodes.phase_starts(onto) if nodes.stance[n] == last]
             for node in first:
                 goal = Stretch.along(nodes, int(node))
                 yield modes, np.asarray(goal.node), goal
