@@ -187,6 +187,8 @@ class Grower:
         """Draw a round of states, and do what each calls for; returns the counts of this round."""
         before = replace(self.counts)
         rng = np.random.default_rng([self.options.seed, self.rounds])
+        if not self.rounds:
+            self._probe(np.flatnonzero(np.isinf(self.nodes.rho) & ~self.nodes.home), rng)
         leg, x = self.region.draw(rng, self.options.round_size)
         walking = self.region.walking(len(leg))
         still = np.flatnonzero(~walking)
@@ -324,7 +326,7 @@ class Grower:
             if isinstance(branch, GivenUp):
                 self.counts.given_up += 1
             elif branch is not None and self._grow(branch, x[row]):
-                self._probe(rng)
+                self._probe(np.arange(self._first, len(self.nodes)), rng)
                 self.counts.grown += 1
                 grown = True
         return grown
@@ -349,10 +351,9 @@ class Grower:
         self.levels = self.levels.extended(len(nodes))
         self._lookup = Lookup(nodes)
 
-    def _probe(self, rng: np.random.Generator) -> None:
-        """Try the funnels of the last branch with states drawn around its nodes."""
+    def _probe(self, new: np.ndarray, rng: np.random.Generator) -> None:
+        """Try the funnels of nodes that nothing has cut with states drawn around them."""
         nodes, count = self.nodes, self.options.probes
-        new = np.arange(self._first, len(nodes))
         new = new[~nodes.late[new] & (nodes.span[new] > 0)]
         node = np.repeat(new, count)
         if not len(node):

@@ -459,9 +459,11 @@ class TreeController:
             walking = self.wanted != UPRIGHT
             leg, ways = np.array([STANCES.index(stance)]), self._ready.tree.nodes.ways
             nodes = preview.candidates(leg, x[None], walking)[0]
-            claims = best.depth <= 1.0 and not (walking and ways[best.node] == Way.UPRIGHT)
-            claimed = [best.node] if claims else NONE
-            self._untried = np.concatenate([claimed, nodes[nodes >= 0]]).astype(int)
+            nodes = nodes[nodes >= 0]
+            if best.depth <= 1.0 and not (walking and ways[best.node] == Way.UPRIGHT):
+                # A robot that comes by an orbit need not take a way to one.
+                nodes = np.insert(nodes, preview.nearest if walking else 0, best.node)
+            self._untried = nodes.astype(int)
             if underway:
                 # At a root time stands still, whatever the clock says.
                 elapsed = 0.0 if tracker.done else tracker.elapsed
