@@ -10,6 +10,8 @@ and *by way of upright* otherwise. It *stands* if the balance controller holds i
 are counted from the push to the first sample after which it is in a tube for half a second.
 
 `LQR alone` is the same controller on a tree of orbits without previews, that leaves no tube.
+
+*Previews* are of states around the orbits, drawn as in the growth of a tree with another seed.
 """
 
 import argparse
@@ -24,12 +26,14 @@ from trees_live import Known, share
 from cg_bringup.balancing import balance
 from cg_control.balance import BALANCING, BalanceController, balance_gains
 from cg_control.basin import shipped_basins
+from cg_control.grow_tree import AROUND, REGION
 from cg_control.nodes import Way
-from cg_control.preview import LANDING
+from cg_control.preview import LANDING, Preview
 from cg_control.recovery import FOLLOWING, ReadyTree, RecoverySettings, TreeController
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_control.walking import WALKING
+from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -38,6 +42,7 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.high_gain import HighGainObserver
 
 SPEEDS = (0.25, 0.35)  # m/s
+DRAWN, SEED = 2000, 99  # states that are previewed
 IMPULSES = (-6.0, -4.0, -2.0, 2.0, 4.0, 6.0)  # N s
 AFTER = 8.0  # s
 HELD = 0.5  # s in a tube that count as back
@@ -140,6 +145,22 @@ def row(name: str, what: str, fared: Sequence[Fared]) -> str:
     )
 
 
+def previews(trees: dict[str, Tree]) -> list[str]:
+    """Table: of states around orbits, those that a preview leads back to one, and home."""
+    first = next(iter(trees.values()))
+    region = WalkingRegion(REGION.half, orbits=OrbitPoints(first.nodes), around=np.array(AROUND))
+    leg, x = region.draw_walking(np.random.default_rng(SEED), DRAWN)
+    lines = ['', '| previews | to an orbit | to an orbit or upright |', '|---|---|---|']
+    for name, tree in trees.items():
+        found = Preview(tree, MODEL, WALKING).choose(leg, x, walking=True)
+        home = found >= 0
+        onto = home & (tree.nodes.ways[found] != Way.UPRIGHT)
+        lines.append(
+            f'| {name} | {share(int(onto.sum()), DRAWN)} | {share(int(home.sum()), DRAWN)} |'
+        )
+    return lines
+
+
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -189,6 +210,7 @@ def main() -> None:
         f'| law | state, speed | {" | ".join(f"{i:g}" for i in IMPULSES)} |',
         f'|---|---|{"---:|" * len(IMPULSES)}',
         *small,
+        *previews(trees),
     ]
     if options.write:
         write_atomically(RESULT, '\n'.join(lines) + '\n')
