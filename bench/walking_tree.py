@@ -44,7 +44,7 @@ from cg_estimation.high_gain import HighGainObserver
 SPEEDS = (0.25, 0.35)  # m/s
 DRAWN, SEED = 2000, 99  # states that are previewed
 IMPULSES = (-6.0, -4.0, -2.0, 2.0, 4.0, 6.0)  # N s
-AFTER = 8.0  # s
+AFTER = 6.0  # s
 HELD = 0.5  # s in a tube that count as back
 EPSILON = 0.01  # s, of the observer
 RESULT = Path(__file__).parent / 'results' / 'walking_tree.md'

@@ -34,6 +34,10 @@ from cg_dynamics.rig import STANCES
 
 log = logging.getLogger(__name__)
 
+# s by which a state in a tube may be off the surface of its phase: more than half of what lies
+# between two knots, so that tubes hold all of the orbit, and less than what leaves the orbit.
+LAG = 0.05
+
 # The phase is the projection on the surfaces, within what a robot can be faster or slower.
 WALKING = TrackingSettings(remedy='phase', pull=500.0, fastest=10.0)
 
@@ -79,7 +83,11 @@ def orbit_nodes(
     motion = stabilise_transversely(with_surfaces(orbit.trajectory, model), model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
-    return Nodes.orbit(motion, model, [phase.cost_to_go / level for phase in motion.phases])
+    # (TUBE) of docs/walking.md: the cost to go says nothing about states ahead on the tangent.
+    return Nodes.orbit(motion, model, [
+        phase.cost_to_go / level + np.einsum('ni,nj->nij', phase.normals, phase.normals) / LAG**2
+        for phase in motion.phases
+    ])  # fmt: skip
 
 
 def tube_level(

@@ -65,6 +65,19 @@ def test_the_region_of_another_tree_is_told_apart(tree, region):
         OrbitPoints(tree.nodes.pruned(np.empty(0, int))[0]._rows(tree.nodes.root_of))
 
 
+def test_tubes_hold_the_orbit_and_not_its_tangents(tree):
+    nodes = tree.nodes
+    moving = nodes.orbiting & ~nodes.impact & nodes.normal.any(axis=1)
+    for node in np.flatnonzero(moving):
+        x0, along = nodes.x0[node], nodes.rates[node]
+        for lag in (-0.1, 0.1):
+            assert nodes.cost_to_go(node, 0.0, x0 + lag * along) > 3.0
+        # Half way to the next knot some knot claims the robot.
+        half = nodes.span[node] / 2
+        x = half ** np.arange(4.0) @ nodes.edges[node][:, 1:5]
+        assert min(nodes.cost_to_go(n, 0.0, x) for n in (node, nodes.next[node])) < 0.8
+
+
 @needs_compiler
 def test_who_walks_tries_what_leads_to_an_orbit_first(tree, robot, states):
     leg, x = states
