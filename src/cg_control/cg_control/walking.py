@@ -142,7 +142,10 @@ def buried(x: np.ndarray, leg: np.ndarray, slope: float = 0.0) -> np.ndarray:
 
 def across(nodes: Nodes, node: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Deviations of cost one on the surfaces of nodes, of random direction: (m, 4)."""
-    values, vectors = np.linalg.eigh(nodes.F[node])
+    # What a deviation costs apart from how far it is along the flow: (TUBE) counts that, too.
+    project = np.eye(4) - np.einsum('ni,nj->nij', nodes.rates[node], nodes.surfaces[node, 0])
+    form = project.transpose(0, 2, 1) @ nodes.F[node] @ project
+    values, vectors = np.linalg.eigh(form)
     # Slow orbits amplify so much that rounding makes the least of the three negative.
     values = np.maximum(values, 1e-9 * values[:, -1:])
     # S costs nothing along the flow: three directions are left.
