@@ -2,6 +2,8 @@
 
 For each state motions are tried in this order, and the first one found is taken:
 
+    onto an orbit    in none, one, ... steps, ending anywhere on the phase of an orbit on the leg
+                     that stands then; of the orbits those that pass by the state most closely
     home             in none, one, ... steps, ending upright on a leg that is a goal
     onto the tree    on the leg that stands, ending anywhere on the stretch behind the node at
                      which the state is least deep; whatever steps that branch takes come with it
@@ -96,6 +98,8 @@ class ExtensionOptions:
         friction: Plan with friction; otherwise the controller gives it back.
         weights: Of the gains.
         near: Depth up to which a motion onto the tree is tried where none goes home; 0: never.
+        orbits: How many orbits are tried; 0: none.
+        orbit_steps: Most steps of a motion that ends on an orbit.
     """
 
     steps: int = 1
@@ -104,6 +108,8 @@ class ExtensionOptions:
     friction: bool = False
     weights: Weights = field(default_factory=Weights)
     near: float = 0.0
+    orbits: int = 0
+    orbit_steps: int = 2
 
 
 class Extension:
@@ -134,23 +140,36 @@ class Extension:
 
     def promising(self, legs: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Least number of steps of a motion that may exist, (n,); more than allowed: none."""
-        least = np.full(len(legs), self.options.steps + 1)
+        return self._least(legs, x)[0]
+
+    def _least(self, legs: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least number of steps of motions to upright and onto an orbit, (n,) each."""
+        most = self.options.steps, self.options.orbit_steps
+        home, orbit = (np.full(len(legs), steps + 1) for steps in most)
         for leg, stance in enumerate(STANCES):
             rows = np.flatnonzero(np.asarray(legs) == leg)
-            if len(rows):
-                reach = self._screen.reach(stance, x[rows])
-                for steps in range(self.options.steps, -1, -1):
-                    least[rows[reach.allows(steps)]] = steps
-        return least
+            if not len(rows):
+                continue
+            reach = self._screen.reach(stance, x[rows])
+            for least, steps, allows in (
+                (home, most[0], reach.allows), (orbit, most[1], reach.allows_orbit),
+            ):  # fmt: skip
+                for count in range(steps, -1, -1):
+                    least[rows[allows(count)]] = count
+        return home, orbit
 
     def __call__(
         self, nodes: Nodes, legs: np.ndarray, x: np.ndarray
     ) -> list[Branch | GivenUp | None]:
         """For each state a branch, None if there is none, or that it was given up."""
-        least, orders = self.promising(legs, x), []
+        (least, onto), orders = self._least(legs, x), []
         node, depth = Lookup(nodes).best_of_many(np.asarray(legs), x)
-        for leg, state, steps, near, deep in zip(legs, x, least, node, depth, strict=True):
+        for leg, state, steps, joins, near, deep in zip(
+            legs, x, least, onto, node, depth, strict=True
+        ):
             order: list[Attempt] = []
+            if self.options.orbits:
+                order += self._onto_orbits(nodes, int(leg), state, int(joins))
             if steps <= self.options.steps:
                 order += self._home(nodes, int(leg), state, int(steps))
                 if near >= 0 and deep < self.options.near:
@@ -170,6 +189,18 @@ class Extension:
             goal = Stretch.along(nodes, node)
             yield self._attempt(nodes, np.asarray(goal.node), (STANCES[leg],), goal, x)
 
+    def _onto_orbits(
+        self, nodes: Nodes, leg: int, x: np.ndarray, steps: int
+    ) -> Iterator[Attempt]:
+        near = nearest_orbits(nodes, leg, x)[: self.options.orbits]
+        for count in range(steps, self.options.orbit_steps + 1):
+            modes = tuple(STANCES[(leg + k) % 2] for k in range(count + 1))
+            for orbit in near:
+                for start in nodes.phase_starts(int(orbit)):
+                    if STANCES[nodes.stance[start]] == modes[-1]:
+                        goal = Stretch.along(nodes, int(start))
+                        yield self._attempt(nodes, np.asarray(goal.node), modes, goal, x)
+
     def _home(self, nodes: Nodes, leg: int, x: np.ndarray, steps: int) -> Iterator[Attempt]:
         for count in range(steps, self.options.steps + 1):
             modes = tuple(STANCES[(leg + k) % 2] for k in range(count + 1))
@@ -185,11 +216,26 @@ class Extension:
         return Attempt.on(nodes, node, task)
 
 
+def nearest_orbits(nodes: Nodes, leg: int, x: np.ndarray) -> np.ndarray:
+    """Numbers of the orbits, those first in whose tube a state is least deep.
+
+    Args:
+        nodes: A tree.
+        leg: Leg that stands, index into STANCES.
+        x: The state, shape (4,).
+    """
+    on = np.flatnonzero(nodes.orbiting & ~nodes.impact & (nodes.stance == leg))
+    away = x - nodes.x0[on]
+    depth = np.full(int(nodes.orbit_of.max()) + 1, np.inf)
+    np.minimum.at(depth, nodes.orbit_of[on], np.einsum('ni,nij,nj->n', away, nodes.F[on], away))
+    return np.argsort(depth, kind='stable')
+
+
 def first_of(order: Sequence[Attempt], model: Model, options: ExtensionOptions) -> Branch | None:
     """The first motion that is found, with gains and funnels; None if there is none."""
     for attempt in order:
         how = cheap(len(attempt.task.modes) - 1, options.fine)
-        if isinstance(attempt.task.goal, Stretch):
+        if isinstance(attempt.task.goal, Stretch) and len(attempt.task.modes) == 1:
             how = dataclasses.replace(how, starts=(SOON,))
         with contextlib.suppress(PlanningError, TrajectoryError):
             motion = optimise(model, attempt.task, how, options.friction)

@@ -1,6 +1,7 @@
-"""Grow a tree to upright, and write its file: docs/trees.md.
+"""Grow a tree to upright, or onto the orbits of one that walks: docs/trees.md, docs/walking.md.
 
     python -m cg_control.grow_tree --goal either --samples 5000 --out tree.npz
+    python -m cg_control.grow_tree --onto walk.npz --samples 4096 --out grown.npz
 
 Gains of the balance controller, basins and the box of the states are those of the compass gait. A
 seed says what grows, whatever the number of workers, and however often the growth is stopped or
@@ -17,6 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +26,14 @@ from cg_control.balance import BalanceSettings, balance_gains
 from cg_control.basin import sample_basin, shipped_basins
 from cg_control.checkpoint import Checkpoint, Keeper
 from cg_control.cluster import Cluster
-from cg_control.extension import Extension, upright_form
+from cg_control.extension import Extension, ExtensionOptions, upright_form
 from cg_control.growth import Counts, Grower, GrowthOptions, Region
-from cg_control.nodes import Nodes
-from cg_control.preview import CHAMPIONS, LANDING, Preview, champions, pruned
+from cg_control.nodes import Nodes, Way
+from cg_control.preview import CHAMPIONS, LANDING, WALKERS, Preview, champions, pruned
 from cg_control.tree import Tree, TreeError
 from cg_control.tvlqr import Weights, balance_regulator
+from cg_control.walking import WALKING
+from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_description.paths import model_path
 from cg_dynamics.cluster import ClusterError
 from cg_dynamics.model import Model
@@ -40,8 +44,11 @@ from cg_dynamics.watched_processes import LIMIT, WatchedProcesses
 GOALS = {'either': STANCES, 'inner': ('inner',), 'outer': ('outer',)}
 BOX = (0.5, 0.8, 1.5, 4.0)  # rad, rad, rad/s, rad/s: Region
 REGION = Region(np.array(BOX), near=0.5)
+AROUND = (0.15, 0.3, 1.2, 3.0)  # likewise, of deviations from an orbit: WalkingRegion
 SWING = 0.3  # rad: amplitude of the swing leg up to which a robot counts as home
 GROWTH = GrowthOptions(at_once=16)
+ORBITS = 2  # that are tried for a state
+RESERVE = 20  # ways upright of each leg, for robots that no way leads back to an orbit
 EVERY = 8.0  # s between lines of progress
 WRITTEN = 10.0  # s between checkpoints, at least
 RECENT = 5  # rounds over which the coverage is counted that they tell
@@ -143,12 +150,14 @@ def grow(
     threads: int = 1,
     checkpoint: Path | None = None,
     branches: int = 0,
+    onto: Tree | None = None,
 ) -> Tree:
     """A tree of so many states, in whole rounds.
 
     Args:
         model: A compass gait.
-        goal: 'either', 'inner' or 'outer': the leg on which it is to stand upright.
+        goal: 'either', 'inner' or 'outer': the leg on which it is to stand upright. That of
+            `onto`, where it is given.
         samples: Least number of states that are drawn.
         seed: Of all that is drawn.
         executor: Whose workers plan; None plans here. The tree does not depend on it,
@@ -156,6 +165,7 @@ def grow(
         checkpoint: File to go on from, if it is there, and to write every few seconds, and where
             this ends before the tree is grown, for whatever reason. It stays when it is grown.
         branches: Keep so many of each leg, the champions, and those that they end on; 0: all.
+        onto: Tree with orbits that grows on: from robots that are pushed while they walk, too.
 
     Raises:
         TreeError: The checkpoint is damaged, or of a tree that was begun otherwise.
@@ -165,12 +175,9 @@ def grow(
         keeper = Keeper(checkpoint, WRITTEN)
         if checkpoint.exists():
             saved = Checkpoint.load(checkpoint, model)
-    extension = Extension(model, legs, executor=executor)
-    grower = Grower(
-        model, upright_tree(model, legs) if saved is None else saved.tree,
-        REGION, extension, replace(GROWTH, seed=seed), simulation=LANDING,
-        threads=threads,
-    )  # fmt: skip
+    options = ExtensionOptions() if onto is None else ExtensionOptions(orbits=ORBITS)
+    extension = Extension(model, legs, options, executor)
+    grower = _planted(model, onto, goal, extension, seed, threads)
     more = {'goal': goal, 'extension': extension.options}
     if saved is not None:
         _require_same(saved, Checkpoint.of(grower, **more), samples, checkpoint)
@@ -185,20 +192,78 @@ def grow(
         if keeper is not None:
             keeper.write()
     tree = grower.tree
-    sample = grower.region.draw(np.random.default_rng([seed, CHAMPIONSHIP]), SAMPLE)
-    order = champions(
-        Preview(tree, model, threads=threads), *sample, count=branches or CHAMPIONS
-    )
+    rng = np.random.default_rng([seed, CHAMPIONSHIP])
+    if isinstance(grower.region, WalkingRegion):
+        sample = grower.region.draw_walking(rng, SAMPLE)
+        preview = Preview(tree, model, WALKING, threads=threads)
+        order = walking_champions(preview, *sample, branches or WALKERS)
+    else:
+        sample = grower.region.draw(rng, SAMPLE)
+        preview = Preview(tree, model, threads=threads)
+        order = champions(preview, *sample, count=branches or CHAMPIONS)
     tree = replace(tree, champions=order)
     if branches:
         tree = pruned(tree)
-    told = {
-        'command': f'grow_tree --goal {goal} --samples {samples} --seed {seed}'
-        f' --branches {branches}',
-        'box': list(BOX),
-        'counts': vars(grower.counts),
-    }
-    return replace(tree, provenance={**tree.provenance, **told})
+    return replace(tree, provenance={
+        **tree.provenance, **_drawn(onto), 'counts': vars(grower.counts),
+        'command': f'grow_tree {f"--goal {goal}" if onto is None else "--onto TREE"} '
+        f'--samples {samples} --seed {seed} --branches {branches}',
+    })  # fmt: skip
+
+
+def _planted(
+    model: Model, onto: Tree | None, goal: str, extension: Extension, seed: int, threads: int
+) -> Grower:
+    """What grows from these homes."""
+    options = replace(GROWTH, seed=seed)
+    if onto is None:
+        return Grower(
+            model, upright_tree(model, GOALS[goal]), REGION, extension, options,
+            simulation=LANDING, threads=threads,
+        )  # fmt: skip
+    region = WalkingRegion(
+        REGION.half, near=REGION.near, orbits=OrbitPoints(onto.nodes), around=np.array(AROUND)
+    )
+    if onto.legs != GOALS[goal]:
+        raise ValueError(f'goal is {goal!r}; the tree is upright on {" or ".join(onto.legs)}')
+    # No state is planned for that the tree brings home already, as far as previews go.
+    options = replace(options, dense=0)
+    return Grower(
+        model, onto, region, extension, options, settings=WALKING, simulation=LANDING,
+        threads=threads,
+    )  # fmt: skip
+
+
+def walking_champions(
+    preview: Preview, leg: np.ndarray, x: np.ndarray, count: int
+) -> np.ndarray:
+    """Champions of a tree that walks: those it has, then those to orbits, then some to upright.
+
+    Args:
+        preview: Of the tree.
+        leg: Legs that stand, of a sample of robots that were pushed, shape (B,).
+        x: The sample, shape (B, nx).
+        count: How many of each leg lead to orbits.
+
+    Returns:
+        Shape (2, m), -1 for none.
+    """
+    nodes = preview.tree.nodes
+    upright = nodes.ways[nodes.entries] == Way.UPRIGHT
+    onto = champions(preview, leg, x, count, nodes.entries[~upright])
+    lost = preview.choose(leg, x, onto[onto >= 0]) < 0
+    rest = champions(preview, leg[lost], x[lost], RESERVE, nodes.entries[upright])
+    found = [preview.tree.champions, onto, np.where(
+        np.isin(rest, preview.tree.champions), -1, rest
+    )]  # fmt: skip
+    return np.hstack(found).astype(np.int32)
+
+
+def _drawn(onto: Tree | None) -> dict[str, Any]:
+    """What the file says of the states that were drawn, and of what the tree grew on."""
+    if onto is None:
+        return {'box': list(BOX)}
+    return {'box': list(BOX), 'around': list(AROUND), 'onto': dict(onto.provenance)}
 
 
 def _require_same(
@@ -228,6 +293,10 @@ def main(args: list[str] | None = None) -> int:
         '--model', default='compass_gait_mit', help='a file or a name [compass_gait_mit]'
     )
     parser.add_argument('--goal', choices=sorted(GOALS), default='either', help='leg [either]')
+    parser.add_argument(
+        '--onto', type=Path, metavar='FILE',
+        help='tree of plan_walk that grows on, with ways back to its orbits',
+    )  # fmt: skip
     parser.add_argument('--samples', type=int, default=5000, help='states to draw [5000]')
     parser.add_argument(
         '--branches', type=int, default=0,
@@ -254,6 +323,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         model = Model.load(model_path(options.model))
         _require_sound(options, checkpoint)
+        onto = Tree.load(options.onto, model) if options.onto else None
         with (
             stopped_by_signals(),
             Cluster(options.scheduler, options.limit)
@@ -262,7 +332,7 @@ def main(args: list[str] | None = None) -> int:
         ):
             tree = grow(
                 model, options.goal, options.samples, options.seed, executor,
-                options.workers or cores, checkpoint, options.branches,
+                options.workers or cores, checkpoint, options.branches, onto,
             )  # fmt: skip
             tree.save(options.out)
             checkpoint.unlink(missing_ok=True)

@@ -23,7 +23,7 @@ import numpy as np
 
 from cg_control.levels import Levels
 from cg_control.lookup import Lookup
-from cg_control.nodes import Nodes
+from cg_control.nodes import Nodes, Way
 from cg_control.preview import AT_HOME, LANDING, Preview
 from cg_control.rollouts import Outcome, Rollouts, follow
 from cg_control.tracking import TrackingSettings
@@ -63,6 +63,10 @@ class Region:
             shrunk = rng.random(count) < self.near
             roles[shrunk] *= rng.random((int(shrunk.sum()), 1))
         return leg, in_coordinates(leg, roles) if len(self.half) == 4 else roles
+
+    def walking(self, count: int) -> np.ndarray:
+        """Which of so many states are those of robots that walk, (count,): none here."""
+        return np.zeros(count, bool)
 
 
 def in_coordinates(leg: np.ndarray, roles: np.ndarray) -> np.ndarray:
@@ -170,7 +174,7 @@ class Grower:
     rounds: int = 0
 
     def __post_init__(self):
-        self.levels = Levels(self.options.tolerated).extended(len(self.tree.nodes))
+        self.levels = Levels.of(self.options.tolerated, self.tree.nodes.rho)
         self._lookup = Lookup(self.tree.nodes)
         self._first = 0
 
@@ -183,13 +187,21 @@ class Grower:
         """Draw a round of states, and do what each calls for; returns the counts of this round."""
         before = replace(self.counts)
         rng = np.random.default_rng([self.options.seed, self.rounds])
+        if not self.rounds:
+            self._probe(np.flatnonzero(np.isinf(self.nodes.rho) & ~self.nodes.home), rng)
         leg, x = self.region.draw(rng, self.options.round_size)
-        open_ = self.look_up(leg, x)
+        walking = self.region.walking(len(leg))
+        still = np.flatnonzero(~walking)
+        open_ = still[self.look_up(leg[still], x[still])]
+        if walking.any():
+            # A claim may lead upright, and who walks shall walk on: previews say where it leads.
+            self._falsify(leg[walking], x[walking])
+            open_ = np.union1d(open_, np.flatnonzero(walking))
         self.counts.samples += len(leg)
         self.counts.unclaimed += len(open_)
         dense = self.counts.samples <= self.options.dense
         if not dense:
-            open_ = self._not_brought_home(open_, leg, x)
+            open_ = self._not_brought_home(open_, leg, x, walking)
         while len(open_):
             now, open_ = open_[: self.options.at_once], open_[self.options.at_once :]
             last = int(self.nodes.branch.max())
@@ -201,28 +213,34 @@ class Grower:
             else:
                 entries = self.nodes.entries
                 new = entries[self.nodes.branch[entries] > last]
-                open_ = self._not_brought_home(open_, leg, x, new)
-        self._falsify(rng)
+                open_ = self._not_brought_home(open_, leg, x, walking, new)
+        for _ in range(self.options.falsifiers):
+            self._falsify(*self.region.draw(rng, self.options.round_size))
         self.rounds += 1
         return Counts(**{k: v - getattr(before, k) for k, v in vars(self.counts).items()})
 
     def _not_brought_home(
-        self, rows: np.ndarray, leg: np.ndarray, x: np.ndarray, entries: np.ndarray | None = None
+        self, rows: np.ndarray, leg: np.ndarray, x: np.ndarray, walking: np.ndarray,
+        entries: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Those of the rows that a preview brings home from none of its entries, or of these."""
+        """Those of the rows that a preview brings home from none of its entries, or of these.
+
+        Home for those that walk is an orbit.
+        """  # fmt: skip
         preview = Preview(
             self.tree, self.model, self.settings, self.simulation, nearest=2 * WIDTH,
             threads=self.threads,
         )  # fmt: skip
-        home = preview.choose(leg[rows], x[rows], entries) >= 0
+        found = preview.choose(leg[rows], x[rows], entries, walking=bool(walking.any()))
+        upright = self.nodes.ways[found] == Way.UPRIGHT
+        home = (found >= 0) & ~(walking[rows] & upright)
         self.counts.previewed += int(home.sum())
         return rows[~home]
 
-    def _falsify(self, rng: np.random.Generator) -> None:
-        """Try what the tree claims of more states."""
+    def _falsify(self, leg: np.ndarray, x: np.ndarray) -> None:
+        """Try what the tree claims of states that are not planned for, or not for that."""
         covered = self.counts.covered
-        for _ in range(self.options.falsifiers):
-            self.look_up(*self.region.draw(rng, self.options.round_size))
+        self.look_up(leg, x)
         self.counts.covered = covered  # of the states that are planned for
 
     def look_up(self, leg: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -308,7 +326,7 @@ class Grower:
             if isinstance(branch, GivenUp):
                 self.counts.given_up += 1
             elif branch is not None and self._grow(branch, x[row]):
-                self._probe(rng)
+                self._probe(np.arange(self._first, len(self.nodes)), rng)
                 self.counts.grown += 1
                 grown = True
         return grown
@@ -333,10 +351,9 @@ class Grower:
         self.levels = self.levels.extended(len(nodes))
         self._lookup = Lookup(nodes)
 
-    def _probe(self, rng: np.random.Generator) -> None:
-        """Try the funnels of the last branch with states drawn around its nodes."""
+    def _probe(self, new: np.ndarray, rng: np.random.Generator) -> None:
+        """Try the funnels of nodes that nothing has cut with states drawn around them."""
         nodes, count = self.nodes, self.options.probes
-        new = np.arange(self._first, len(nodes))
         new = new[~nodes.late[new] & (nodes.span[new] > 0)]
         node = np.repeat(new, count)
         if not len(node):

@@ -33,6 +33,17 @@ class Levels:
     home: np.ndarray = field(default_factory=lambda: np.zeros((0, BINS + 1), np.int32))
     failed: np.ndarray = field(default_factory=lambda: np.zeros((0, BINS + 1), np.int32))
 
+    @classmethod
+    def of(cls, tolerated: float, rho: np.ndarray) -> 'Levels':
+        """As if one robot had failed just beyond each level that is known, (n,).
+
+        So a level is kept until more is known: what comes by later counts with it.
+        """
+        levels = cls(tolerated).extended(len(rho))
+        cut = np.flatnonzero(rho <= EDGES[-2])
+        levels.failed[cut, np.searchsorted(EDGES, rho[cut] * (1 + 1e-9))] = 1
+        return levels
+
     def extended(self, count: int) -> 'Levels':
         """With room for so many nodes."""
         rows = count - len(self.home)

@@ -381,6 +381,11 @@ class Nodes:
             count += 1
         return number[self._end]
 
+    def phase_starts(self, orbit: int) -> np.ndarray:
+        """The nodes of an orbit to which impacts lead, right after them: shape (phases,)."""
+        on = self.orbiting & (self.orbit_of == orbit)
+        return np.unique(self.landing[on & self.impact])
+
     @functools.cached_property
     def root_of(self) -> np.ndarray:
         """The root of each stance leg, -1 for none, shape (2,)."""

@@ -19,7 +19,9 @@ import numpy as np
 
 from cg_control.levels import FINEST
 from cg_control.lookup import UNCUT, lifted, monomials
+from cg_control.nodes import Way
 from cg_control.rollouts import Outcome, follow
+from cg_control.routes import Routes
 from cg_control.tracking import TrackingSettings
 from cg_control.tree import Tree
 from cg_dynamics.batch import WIDTH
@@ -29,6 +31,7 @@ from cg_dynamics.rig import STANCES
 
 NEAREST = 4
 CHAMPIONS = 60  # of each leg
+WALKERS = 40  # of each leg, that lead to an orbit
 # A robot that leans or swings its leg further counts as lost; plans swing it to 1.5 rad.
 LANDING = WalkOptions(
     sample_time=0.002, step=0.002, minimum_step=0.1, fall_angle=0.6, swing_angle=2.0
@@ -67,7 +70,11 @@ class Preview:
         self._depths = costs / level[:, None]
 
     def choose(
-        self, leg: np.ndarray, x: np.ndarray, entries: np.ndarray | None = None
+        self,
+        leg: np.ndarray,
+        x: np.ndarray,
+        entries: np.ndarray | None = None,
+        walking: bool = False,
     ) -> np.ndarray:
         """An entry that brings each state home, the first that does; -1 for none: shape (B,).
 
@@ -75,9 +82,10 @@ class Preview:
             leg: Leg that stands, index into STANCES, shape (B,).
             x: States, shape (B, nx).
             entries: These in place of the `candidates`, shape (m,).
+            walking: An orbit is wanted, and upright is second best.
         """
         if entries is None:
-            tried = self.candidates(leg, x)
+            tried = self.candidates(leg, x, walking)
         else:
             fits = self.tree.nodes.stance[entries] == np.asarray(leg)[:, None]
             tried = np.where(fits, entries, -1)
@@ -92,18 +100,31 @@ class Preview:
             found[rows] = some[rows, home[rows].argmax(axis=1)]
         return found
 
-    def candidates(self, leg: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def candidates(
+        self, leg: np.ndarray, x: np.ndarray, walking: bool = False
+    ) -> np.ndarray:
         """Entries to try, in order: the least deep ones, the champions.
 
-        Arguments as `choose`. Shape (B, nearest + champions), -1 where there are no more.
+        Where the robot is to walk the least deep nodes of orbits come first, then what else leads
+        to an orbit. Arguments as `choose`. Shape (B, m), -1 where there are no more.
         """
-        nodes = self.tree.nodes
+        nodes, leg = self.tree.nodes, np.asarray(leg)
         depth = monomials(x[:, : nodes.x0.shape[1]]) @ self._depths.T
-        elsewhere = nodes.stance[self._entries] != np.asarray(leg)[:, None]
-        depth[elsewhere] = np.inf
+        depth[nodes.stance[self._entries] != leg[:, None]] = np.inf
+        tried = np.hstack([self._least_deep(depth), self.tree.champions[leg]])
+        if not walking:
+            return tried
+        # A branch that nothing has cut seems less deep than any tube: orbits for themselves.
+        depth[:, ~nodes.orbiting[self._entries]] = np.inf
+        tried = np.hstack([self._least_deep(depth), tried])
+        last = (tried < 0) | (nodes.ways[tried] == Way.UPRIGHT)
+        return np.take_along_axis(tried, np.argsort(last, axis=1, kind='stable'), axis=1)
+
+    def _least_deep(self, depth: np.ndarray) -> np.ndarray:
+        """The entries of least depth: (B, nearest), -1 where it is infinite."""
         order = np.argsort(depth, axis=1, kind='stable')[:, : self.nearest]
-        near = np.where(np.take_along_axis(elsewhere, order, axis=1), -1, self._entries[order])
-        return np.hstack([near, self.tree.champions[np.asarray(leg)]])
+        away = np.isinf(np.take_along_axis(depth, order, axis=1))
+        return np.where(away, -1, self._entries[order])
 
     def brings_home(
         self, node: np.ndarray, x: np.ndarray, elapsed: np.ndarray | None = None
@@ -126,15 +147,20 @@ class Preview:
 
 
 def pruned(tree: Tree) -> Tree:
-    """A tree without the branches that begin at no champion."""
-    named = tree.champions
-    nodes, place = tree.nodes.pruned(np.unique(tree.nodes.branch[named[named >= 0]]))
+    """A tree without the branches that begin at no champion and lead to no other home."""
+    named, leave = tree.champions, Routes.of(tree.nodes, tree.speeds.tolist()).departures
+    kept = np.append(named[named >= 0], [d.entry for d in leave]).astype(int)
+    nodes, place = tree.nodes.pruned(np.unique(tree.nodes.branch[kept]))
     moved = np.where(named < 0, -1, place[named]).astype(np.int32)
     return replace(tree, nodes=nodes, champions=moved)
 
 
 def champions(
-    preview: Preview, leg: np.ndarray, x: np.ndarray, count: int = CHAMPIONS
+    preview: Preview,
+    leg: np.ndarray,
+    x: np.ndarray,
+    count: int = CHAMPIONS,
+    entries: np.ndarray | None = None,
 ) -> np.ndarray:
     """The entries that together bring most states home: shape (2, count), -1 for no more.
 
@@ -143,9 +169,10 @@ def champions(
         leg: Legs that stand, of a sample of states, shape (B,).
         x: The sample, shape (B, nx).
         count: How many of each leg.
+        entries: Of these, shape (m,); None: of all.
     """
     nodes = preview.tree.nodes
-    entries = nodes.entries
+    entries = nodes.entries if entries is None else entries
     chosen = np.full((len(STANCES), count), -1)
     for number in range(len(STANCES)):
         own, mine = entries[nodes.stance[entries] == number], x[leg == number]

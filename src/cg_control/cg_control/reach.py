@@ -14,6 +14,9 @@ with a hundred torques at the limit, switched at most twice, all at once (cg_dyn
     one step     the same, or a landing after which |zeta| is small on the other leg
     more steps   the same, or a landing after which the robot does not fall backward
 
+A motion that ends on an orbit goes on from there, so it need not be able to stop: it may exist
+where the robot does not fall backward, now or after its landing.
+
 Linear modes and a finite choice of torques err. The levels leave room for that;
 bench/results/trees_screen.md has the shares of wrong noes against a census of many guesses.
 """
@@ -67,6 +70,10 @@ class Reach:
             return kept
         # A robot that can be kept up has time for any step.
         return kept | (self.landing <= LANDED if steps == 1 else self.ahead >= AHEAD)
+
+    def allows_orbit(self, steps: int) -> np.ndarray:
+        """Whether a motion of so many steps that ends on an orbit may exist, shape (B,)."""
+        return self.zeta > -HELD if steps == 0 else self.allows(2)
 
 
 class Screen:

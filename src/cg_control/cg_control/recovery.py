@@ -14,7 +14,8 @@ At every measurement, in this order:
        there and home is not further.                                                    (SWITCH)
     3. Where no funnel holds it, the tree is previewed (preview.py): the robot stays on its way
        if that brings it home in simulation, or goes over to an entry that does. The entries
-       are tried over as many samples as it takes, so that none is answered late.      (PREVIEW)
+       are tried over as many samples as it takes, so that none is answered late. Where the
+       robot is to walk, those that lead to an orbit come before those to upright.     (PREVIEW)
     4. Where nothing brings it home there is no torque, until something does.          (OUTSIDE)
 
 Nothing is planned meanwhile: what a push does to the state is answered by another node. A foot
@@ -455,9 +456,14 @@ class TreeController:
         assert self._ready is not None
         preview, tracker = self._ready.preview, self._ready.tracker
         if not len(self._untried):
-            nodes = preview.candidates(np.array([STANCES.index(stance)]), x[None])[0]
-            claimed = [best.node] if best.depth <= 1.0 else NONE
-            self._untried = np.concatenate([claimed, nodes[nodes >= 0]]).astype(int)
+            walking = self.wanted != UPRIGHT
+            leg, ways = np.array([STANCES.index(stance)]), self._ready.tree.nodes.ways
+            nodes = preview.candidates(leg, x[None], walking)[0]
+            nodes = nodes[nodes >= 0]
+            if best.depth <= 1.0 and not (walking and ways[best.node] == Way.UPRIGHT):
+                # A robot that comes by an orbit need not take a way to one.
+                nodes = np.insert(nodes, preview.nearest if walking else 0, best.node)
+            self._untried = nodes.astype(int)
             if underway:
                 # At a root time stands still, whatever the clock says.
                 elapsed = 0.0 if tracker.done else tracker.elapsed

@@ -33,6 +33,10 @@ from cg_dynamics.rig import STANCES
 
 log = logging.getLogger(__name__)
 
+# s by which a state in a tube may be off the surface of its phase: more than half of what lies
+# between two knots, so that tubes hold all of the orbit, and less than what leaves the orbit.
+LAG = 0.05
+
 # The phase is the projection on the surfaces, within what a robot can be faster or slower.
 WALKING = TrackingSettings(remedy='phase', pull=500.0, fastest=10.0)
 
@@ -78,7 +82,11 @@ def orbit_nodes(
     motion = stabilise_over_phase(orbit.trajectory, model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
-    return Nodes.orbit(motion, model, [phase.cost_to_go / level for phase in motion.phases])
+    # (TUBE) of docs/walking.md: the cost to go says nothing about states ahead on the tangent.
+    return Nodes.orbit(motion, model, [
+        phase.cost_to_go / level + np.einsum('ni,nj->nij', phase.normals, phase.normals) / LAG**2
+        for phase in motion.phases
+    ])  # fmt: skip
 
 
 def tube_level(
@@ -133,7 +141,10 @@ def buried(x: np.ndarray, leg: np.ndarray, slope: float = 0.0) -> np.ndarray:
 
 def across(nodes: Nodes, node: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Deviations of cost one on the surfaces of nodes, of random direction: (m, 4)."""
-    values, vectors = np.linalg.eigh(nodes.F[node])
+    # What a deviation costs apart from how far it is along the flow: (TUBE) counts that, too.
+    project = np.eye(4) - np.einsum('ni,nj->nij', nodes.rates[node], nodes.surfaces[node, 0])
+    form = project.transpose(0, 2, 1) @ nodes.F[node] @ project
+    values, vectors = np.linalg.eigh(form)
     # Slow orbits amplify so much that rounding makes the least of the three negative.
     values = np.maximum(values, 1e-9 * values[:, -1:])
     # S costs nothing along the flow: three directions are left.
@@ -177,7 +188,7 @@ def with_ways(
     wanted: list[tuple[int, int]] = []  # (node to leave from, home to go to)
     roots = np.flatnonzero(nodes.planned < 0)
     for orbit in range(count):
-        leaves = phase_starts(nodes, orbit)
+        leaves = nodes.phase_starts(orbit)
         if orbit == 0:
             wanted += [(int(root), orbit) for root in roots]
             wanted += [(int(node), -1) for node in leaves]
@@ -198,12 +209,6 @@ def with_ways(
     if not ways:
         raise TrajectoryError('no motion leads from any home of the tree to another')
     return replace(tree, nodes=nodes)
-
-
-def phase_starts(nodes: Nodes, orbit: int) -> np.ndarray:
-    """The nodes of an orbit to which impacts lead, right after them: shape (phases,)."""
-    on = nodes.orbiting & (nodes.orbit_of == orbit)
-    return np.unique(nodes.landing[on & nodes.impact])
 
 
 def planned(
@@ -240,7 +245,7 @@ def _ends(
             if len(roots):
                 yield modes, roots[:1], UPRIGHT
         elif impacts:
-            first = [n for n in phase_starts(nodes, onto) if nodes.stance[n] == last]
+            first = [n for n in nodes.phase_starts(onto) if nodes.stance[n] == last]
             for node in first:
                 goal = Stretch.along(nodes, int(node))
                 yield modes, np.asarray(goal.node), goal

@@ -58,3 +58,13 @@ def test_room_for_more_nodes_keeps_what_was_counted():
     levels = levels.extended(4)
     assert levels.rho(np.array([0])) == before
     assert np.isinf(levels.rho(np.array([1, 2, 3]))).all()
+
+
+def test_levels_that_are_known_are_kept_until_more_is_known():
+    known = np.array([EDGES[20], np.inf, EDGES[0], 0.0])
+    levels = Levels.of(0.01, known)
+    np.testing.assert_allclose(levels.rho(np.arange(4)), known)
+    levels.add(np.zeros(200, int), np.full(200, EDGES[25]), np.ones(200, bool))
+    assert levels.rho(np.array([0])) == np.inf
+    levels.add(np.ones(1, int), np.ones(1), np.zeros(1, bool))
+    assert levels.rho(np.array([1])) < 1.0

@@ -22,7 +22,6 @@ from cg_control.walking import (
     across,
     buried,
     orbit_nodes,
-    phase_starts,
     tube_level,
     with_orbits,
     with_ways,
@@ -68,14 +67,15 @@ def test_a_motion_that_is_not_periodic_is_no_orbit(robot, step):
 
 
 def test_the_robot_walks_on_its_orbit(robot, nodes, orbit):
-    start = phase_starts(nodes, 0)
+    start = nodes.phase_starts(0)
     done = follow(
         nodes, robot, start, nodes.x0[start], 2.1 * orbit.period, settings=WALKING, options=LANDING
     )
     assert done.impacts.tolist() == [4, 4]
     for node, elapsed, x in zip(done.node, done.elapsed, done.state, strict=True):
         # Torque is held for 2 ms, where the plan's is continuous.
-        assert nodes.cost_to_go(int(node), float(elapsed), x) < 1e-3
+        # The reference is up to a sample off, (0.002 s / 0.05 s)^2 by (TUBE).
+        assert nodes.cost_to_go(int(node), float(elapsed), x) < 1e-3 + (0.002 / 0.05) ** 2
 
 
 def near(nodes, node, cost, seed):
@@ -156,7 +156,7 @@ def test_arriving_is_being_in_the_tube_on_the_orbit(robot, shipped, compiled, mo
 
 
 def test_rollouts_on_an_orbit_are_those_of_walk_and_tracker(robot, nodes, orbit):
-    start = phase_starts(nodes, 0)
+    start = nodes.phase_starts(0)
     x = nodes.x0[start] + [[0.004, -0.003, 0.02, 0.03], [-0.002, 0.004, -0.02, 0.02]]
     seconds = 1.2 * orbit.period
     found = follow(nodes, robot, start, x, seconds, settings=WALKING, options=LANDING)
