@@ -36,6 +36,7 @@ from cg_dynamics.linearise import without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
+SWEEPS, SETTLED = 200, 1e-9  # periods until a cost to go repeats itself, and to what share
 GAUSS = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
 
 
@@ -122,13 +123,13 @@ def stabilise(
     """
     trajectory.require_model(model)
     weights = weights or Weights()
+    design = without_dry_friction(planning_model(model))
     S = final_cost
     if S is None:
         S = weights.final * balance_regulator(model, trajectory.modes[-1]).S
     S = np.array(S, float)
     if S.shape != (4, 4) or not np.allclose(S, S.T):
         raise ValueError(f'final_cost must be a symmetric (4, 4) matrix, got shape {S.shape}')
-    design = without_dry_friction(planning_model(model))
     phases: list[Phase] = []
     after: Phase | None = None
     for phase in reversed(trajectory.phases):
@@ -142,6 +143,51 @@ def stabilise(
         after = phase
         phases.append(replace(phase, gains=gains, cost_to_go=costs))
     return trajectory.with_phases(tuple(reversed(phases)), weights=vars(weights))
+
+
+def stabilise_periodically(
+    trajectory: Trajectory,
+    model: Model,
+    weights: Weights | None = None,
+    restarts: bool = False,
+) -> Trajectory:
+    """An orbit with gains over time and the cost to go that repeats itself after a period.
+
+    Args:
+        trajectory: Periodic, planned for this model.
+        model: As in `stabilise`.
+        weights: Of deviations; `final` has no part.
+        restarts: The clock starts anew where a foot lands, (RESTART) of docs/walking.md, as
+            with the remedy `event` of tracking.py; else it goes on, (SALT).
+
+    Raises:
+        TrajectoryError: if the motion is not periodic, or the cost to go does not settle.
+    """
+    trajectory.require_model(model)
+    if not trajectory.provenance.get('periodic', False):
+        raise TrajectoryError('the trajectory is not periodic; no cost to go repeats itself')
+    weights = weights or Weights()
+    design = without_dry_friction(planning_model(model))
+    slope, phases = trajectory.provenance.get('slope', 0.0), trajectory.phases
+    jumps = [
+        jump_matrix(design, phase, phases[(k + 1) % len(phases)], slope, restarts)
+        for k, phase in enumerate(phases)
+    ]
+    S = weights.Q(phases[0].stance)
+    for _ in range(SWEEPS):
+        before, found = S, []
+        for phase, jump in zip(reversed(phases), reversed(jumps), strict=True):
+            gains, costs = riccati(
+                design, phase, weights.Q(phase.stance), weights.R, jump.T @ S @ jump
+            )
+            found.append(replace(phase, gains=gains, cost_to_go=costs))
+            S = costs[0]
+        size = np.abs(S).max()
+        if not np.isfinite(size):
+            break
+        if np.abs(S - before).max() <= SETTLED * size:
+            return trajectory.with_phases(tuple(reversed(found)), weights=vars(weights))
+    raise TrajectoryError(f'the cost to go does not settle within {SWEEPS} periods')
 
 
 def riccati(
