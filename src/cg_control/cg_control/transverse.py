@@ -36,6 +36,7 @@ from cg_control.tvlqr import (
     jump_matrix,
     linearised,
     magnus,
+    stabilise_periodically,
 )
 from cg_dynamics.model import Model
 
@@ -142,6 +143,36 @@ def stabilise_transversely(
         gains = (np.linalg.inv(weights.R) @ B.transpose(0, 2, 1) @ cost)[:, 0, :]
         phases.append(replace(phase, gains=gains, cost_to_go=cost))
     return trajectory.with_phases(tuple(phases), weights=vars(weights), feedback='transverse')
+
+
+def stabilise_over_phase(
+    trajectory: Trajectory, model: Model, weights: Weights | None = None
+) -> Trajectory:
+    """An orbit with the gains of TVLQR, on surfaces that its own cost to go asks for: (OWN).
+
+    The clock of the design starts anew at impacts, `stabilise_periodically`. The phase of a robot
+    is the point of the orbit that costs least to go to, x0'S (x - x0) = 0. The cost to go is that
+    of deviations in the surface, of rank 3; gains see what is ahead or behind, too, which counts
+    where the phase cannot follow: at the ends of a phase and beyond.
+
+    Args:
+        trajectory: Periodic; surfaces that it has are replaced.
+        model: The one it was planned for.
+        weights: Of deviations; None takes those of `tvlqr`.
+
+    Raises:
+        TrajectoryError: as `stabilise_periodically`.
+    """
+    motion = stabilise_periodically(trajectory, model, weights, restarts=True)
+    phases = []
+    for phase in motion.phases:
+        S, rates = phase.cost_to_go, phase.rates
+        normals = np.einsum('nij,nj->ni', S, rates)
+        normals /= np.einsum('ni,ni->n', normals, rates)[:, None]
+        across = np.eye(4) - rates[:, :, None] * normals[:, None, :]
+        cost = across.transpose(0, 2, 1) @ S @ across
+        phases.append(replace(phase, normals=normals, cost_to_go=cost))
+    return motion.with_phases(tuple(phases), surfaces='own', feedback='over phase')
 
 
 @dataclass(frozen=True)
