@@ -395,6 +395,7 @@ def walked(
     leg, x = flock.leg.copy(), flock.x.copy()
     impacts, time, torque = np.zeros(n, int), np.zeros(n), np.zeros(n)
     standing = np.ones(n, bool)
+    held = np.zeros(n)
     late = np.zeros((n, int(flock.delay.max(initial=0)) + 1))
     seen = np.flatnonzero(flock.observed)
     place = np.full(n, -1)
@@ -407,7 +408,7 @@ def walked(
         mine = flock.observed[who]
         if mine.any() and tick:
             some = who[mine]
-            told[mine] = observers.step(place[some], leg[some], x[some], torque_now[some])
+            told[mine] = observers.step(place[some], leg[some], x[some], held[some])
         told[:, 2:] += flock.noise[who, None] * rng.standard_normal((len(who), 2))
         hip = (told[:, 0] - told[:, 1])[None], (told[:, 2] - told[:, 3])[None]
         taken = np.asarray(friction(*hip, friction_p)).ravel() * flock.compensates[who]
@@ -415,9 +416,7 @@ def walked(
         late[:, 1:] = late[:, :-1]
         late[who, 0] = u
         acts = late[who, flock.delay[who]]
-        if tick == 0:
-            torque_now = np.zeros(n)
-        torque_now[who] = u
+        held[who] = u
         torque[who] = np.maximum(torque[who], np.abs(acts))
         y = x[who]
         hang = np.full(len(who), SAMPLE_TIME)

@@ -53,13 +53,13 @@ class Constraint:
             TrajectoryError: The stance leg does not move forward all the time.
         """
         st = STANCES.index(phase.stance)
-        angle, forward, bends = phase.states[:, st], phase.states[:, 2 + st], phase.rates[:, 2 + st]
+        angle, forward = phase.states[:, st], phase.states[:, 2 + st]
         if not (forward > 0).all():
             raise TrajectoryError(
                 f'the {phase.stance} leg stops or turns back: its angle tells no phase'
             )
         slope = phase.states[:, 3 - st] / forward
-        curvature = (phase.rates[:, 3 - st] - slope * bends) / forward**2
+        curvature = (phase.rates[:, 3 - st] - slope * phase.rates[:, 2 + st]) / forward**2
         knots = np.column_stack([phase.states[:, 1 - st], slope, curvature])
         h = scipy.interpolate.BPoly.from_derivatives(angle, knots)
         return cls(h, h.derivative(), h.derivative(2), float(angle[0]), float(angle[-1]))

@@ -21,11 +21,10 @@ from cg_control.nodes import Nodes
 from cg_control.orbit import Orbit
 from cg_control.preview import LANDING
 from cg_control.rollouts import follow
-from cg_control.surfaces import with_surfaces
 from cg_control.task import UPRIGHT, Box, Goal, Stretch, Task
 from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import TrajectoryError
-from cg_control.transverse import stabilise_transversely
+from cg_control.transverse import stabilise_over_phase
 from cg_control.tree import Tree
 from cg_control.tvlqr import Weights
 from cg_dynamics.hybrid import WalkOptions
@@ -64,7 +63,7 @@ def orbit_nodes(
     tube: TubeOptions | None = None,
     simulation: WalkOptions = LANDING,
 ) -> Nodes:
-    """An orbit under transverse LQR, with the tube in which it was seen to hold the robot.
+    """An orbit with gains over phase, and the tube in which it was seen to hold the robot.
 
     Args:
         model: The robot.
@@ -76,7 +75,7 @@ def orbit_nodes(
     Raises:
         TrajectoryError: The orbit holds hardly a robot.
     """
-    motion = stabilise_transversely(with_surfaces(orbit.trajectory, model), model, weights)
+    motion = stabilise_over_phase(orbit.trajectory, model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
     return Nodes.orbit(motion, model, [phase.cost_to_go / level for phase in motion.phases])

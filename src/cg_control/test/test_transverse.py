@@ -12,20 +12,33 @@ from scipy.integrate import solve_ivp
 
 from cg_control import transverse
 from cg_control.collocation import Options, optimise, planning_model
+from cg_control.nodes import Nodes
 from cg_control.orbit import plan_orbit
+from cg_control.preview import LANDING
+from cg_control.rollouts import follow
 from cg_control.surfaces import UNITS, between, design_of, phase_of, with_surfaces
 from cg_control.task import Box, Task
 from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import (
+    OVER_PHASE,
     WALKING,
     UnstableError,
     frame,
     monodromy,
     projection,
+    stabilise_over_phase,
     stabilise_transversely,
     transverse_linearisation,
 )
-from cg_control.tvlqr import GAUSS, exponentials, jump_matrix, magnus, stabilise
+from cg_control.tvlqr import (
+    GAUSS,
+    exponentials,
+    jump_matrix,
+    magnus,
+    stabilise,
+    stabilise_periodically,
+)
+from cg_control.walking import WALKING as ON_SURFACES
 from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact
 
@@ -335,3 +348,31 @@ def test_what_cannot_be_is_refused(gait, orbit, walker, monkeypatch):
     monkeypatch.setattr(transverse, 'SWEEPS', 1)
     with pytest.raises(UnstableError, match='does not settle'):
         stabilise_transversely(orbit, walker)
+
+
+def test_gains_over_phase_hold_the_robot_on_surfaces_of_their_own_cost(gait, walker):
+    """A surface is where, along the motion, the cost to go is least; along it nothing costs."""
+    done = stabilise_over_phase(gait, walker)
+    over_time = stabilise_periodically(gait, walker, OVER_PHASE, restarts=True)
+    rng = np.random.default_rng(7)
+    for phase, plain in zip(done.phases, over_time.phases, strict=True):
+        np.testing.assert_allclose((phase.normals * phase.rates).sum(axis=1), 1.0, atol=1e-12)
+        np.testing.assert_allclose(phase.normals[-1][2:], 0.0)
+        for k in (0, 10, -3):
+            S, t, n = plain.cost_to_go[k], phase.rates[k], phase.normals[k]
+            d = rng.normal(size=4) * UNITS
+            d -= t * (n @ d)  # in the surface
+            least = d @ S @ d
+            np.testing.assert_allclose(phase.cost_to_go[k] @ t, 0.0, atol=1e-9 * np.abs(S).max())
+            assert d @ phase.cost_to_go[k] @ d == pytest.approx(least, rel=1e-9)
+            for off in (-1e-3, 1e-3):
+                assert (d - off * t) @ S @ (d - off * t) > least
+    x = done.states[0] + 0.3 * UNITS * [1, -1, 1, 1]
+    nodes = Nodes.orbit(done, walker)
+    ends = follow(
+        nodes, walker, np.zeros(1, int), x[None], 20 * done.duration / 2, settings=ON_SURFACES,
+        options=replace(LANDING, slope=SLOPE),
+    )  # fmt: skip
+    cost = nodes.cost_to_go(int(ends.node[0]), float(ends.elapsed[0]), ends.state[0])
+    assert ends.impacts[0] >= 15
+    assert cost < 1e-3 * nodes.cost_to_go(0, 0.0, x)

@@ -1,13 +1,17 @@
 """TVLQR against solve_ivp, LQR, scipy's exponential and simulated deviations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from cg_control.collocation import Options, optimise, planning_model
+from cg_control.floquet import multipliers
 from cg_control.linearise import design_model, linearise_stance
 from cg_control.lqr import lqr
+from cg_control.orbit import plan_orbit
 from cg_control.task import Task
 from cg_control.trajectory import Phase, TrajectoryError
 from cg_control.tvlqr import (
@@ -19,6 +23,7 @@ from cg_control.tvlqr import (
     linearised,
     riccati,
     stabilise,
+    stabilise_periodically,
 )
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
@@ -165,3 +170,34 @@ def test_a_weak_motor_that_is_known_gets_larger_gains(robot):
     )
     # One is a motor that nobody knows of, two the same torque at any price.
     assert 1.1 < second.phases[0].gains[0][0] / first.phases[0].gains[0][0] < 2.0
+
+
+@pytest.fixture(scope='module')
+def gait(robot):
+    return plan_orbit(robot, 0.35, 0.3)
+
+
+@pytest.mark.parametrize('restarts', [False, True])
+def test_cost_to_go_of_an_orbit_repeats_itself(robot, gait, restarts):
+    done = stabilise_periodically(gait.trajectory, robot, restarts=restarts)
+    first, last = done.phases[0], done.phases[-1]
+    jump = jump_matrix(design_model(robot), last, first, restarts=restarts)
+    S = jump.T @ first.cost_to_go[0] @ jump
+    np.testing.assert_allclose(last.cost_to_go[-1], S, atol=1e-6 * np.abs(S).max())
+    if not restarts:
+        again = stabilise(gait.trajectory, robot, final_cost=(S + S.T) / 2)
+        for one, other in zip(again.phases, done.phases, strict=True):
+            size = np.abs(other.cost_to_go).max()
+            np.testing.assert_allclose(one.cost_to_go, other.cost_to_go, atol=1e-6 * size)
+
+
+def test_periodic_gains_hold_what_a_restarting_clock_says(robot, gait):
+    """Multipliers by (RESTART) are those of another module, and inside the unit circle."""
+    done = stabilise_periodically(gait.trajectory, robot, restarts=True)
+    values = multipliers(replace(gait, trajectory=done), feedback=True)
+    assert np.abs(values).max() < 0.5 < np.abs(multipliers(gait)).max()
+
+
+def test_motion_that_ends_is_no_orbit(robot, step):
+    with pytest.raises(TrajectoryError, match='not periodic'):
+        stabilise_periodically(step, robot)
