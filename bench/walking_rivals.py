@@ -348,9 +348,9 @@ def passive_lines() -> list[str]:
     hits = int((walked(classic, flock, Passive(), STEPS, 30.0).impacts >= STEPS).sum())
     lines = [
         f'*Passive.* Of {count} random starts of this robot without friction and torque, on '
-        f'slopes of 0.5 to 5 degrees, the longest walk had {most.max()} steps: no gait was found. The '
-        f'classic compass gait (20 kg, 1 m, 3 degrees) walks on from {interval(hits, STARTS)} of '
-        'the same box around its own gait.'
+        f'slopes of 0.5 to 5 degrees, the longest walk had {most.max()} steps: no gait was found. '
+        f'The classic compass gait (20 kg, 1 m, 3 degrees) walks on from '
+        f'{interval(hits, STARTS)} of the same box around its own gait.'
     ]
     print(*lines, flush=True)
     return lines
@@ -399,7 +399,7 @@ def main() -> None:
             '',
             'Phase over 10 steps on the surfaces of `over phase`: robots of 10 that made them; '
             'then bias and standard deviation of how far the phase of the true state is ahead, '
-            'ms, standard deviation of ds/dt, share of samples at which surfaces meet (lost phases):',
+            'ms, standard deviation of ds/dt, share of samples at which surfaces meet (lost):',
             '',
             *phases,
         ]

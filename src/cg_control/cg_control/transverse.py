@@ -154,9 +154,9 @@ def stabilise_over_phase(
     """An orbit with the gains of TVLQR, on surfaces that its own cost to go asks for: (OWN).
 
     The clock of the design starts anew at impacts, `stabilise_periodically`. The phase of a robot
-    is the point of the orbit that costs least to go to, x0'S (x - x0) = 0, and at the end of a
-    phase the impact surface. The cost to go is that of deviations in the surface, of rank 3; gains see what is ahead or behind, too, which counts
-    where the phase cannot follow: at the ends of a phase and beyond.
+    is the point of the orbit that costs least to go to, x0'S (x - x0) = 0; a phase ends with the
+    impact surface. The cost to go is that of deviations in the surface, of rank 3. Gains see what
+    is ahead or behind, too: it counts where the phase cannot follow, at the ends of a phase.
 
     Args:
         trajectory: Periodic; surfaces that it has are replaced.
