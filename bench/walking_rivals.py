@@ -377,7 +377,7 @@ def main() -> None:
             '',
             f'Made by `python bench/walking_rivals.py --write`, {time.process_time() - began:.0f} '
             f's CPU, Python {platform.python_version()}, {platform.machine()}; what is measured '
-            'is said at the top of the script. ' + ('' if done else 'Not all of it was run.'),
+            'is said at the top of the script.' + ('' if done else ' Not all of it was run.'),
             '',
             f'{STARTS} starts of the basin, {ROBOTS} robots a cell of what follows. Push: N s, '
             'forward, backward: mean over phases, least in parentheses. The basin of the tree are '
