@@ -2,6 +2,7 @@
 
     python bench/walking_rivals.py              prints the tables
     python bench/walking_rivals.py --write      stores them as bench/results/walking_rivals.md
+    python bench/walking_rivals.py --phases     only the table of phases
 
 Orbits of 0.25 and 0.35 m/s with steps of 0.3 m on even ground. Robots are those of flock.py:
 hybrid and exact, commands held for 2 ms and limited to 40 N m. A robot walked if it makes 20 steps
@@ -359,7 +360,12 @@ def passive_lines() -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split('\n', 1)[0])
     parser.add_argument('--write', action='store_true')
+    parser.add_argument('--phases', action='store_true', help='print the table of phases only')
     options = parser.parse_args()
+    if options.phases:
+        orbit = plan_orbit(ROBOT, SPEEDS[1], STEP)
+        print(*phase_rows(orbit), '', costs(orbit), sep='\n')
+        return
     began = time.process_time()
     passive, table, distance, phases, tree_rows = passive_lines(), [], [], [], []
     tree = Tree.load(tree_path('compass_gait_mit_walk'), ROBOT)
@@ -371,7 +377,7 @@ def main() -> None:
             '',
             f'Made by `python bench/walking_rivals.py --write`, {time.process_time() - began:.0f} '
             f's CPU, Python {platform.python_version()}, {platform.machine()}; what is measured '
-            'is said at the top of the script. ' + ('' if done else 'Not all of it was run.'),
+            'is said at the top of the script.' + ('' if done else ' Not all of it was run.'),
             '',
             f'{STARTS} starts of the basin, {ROBOTS} robots a cell of what follows. Push: N s, '
             'forward, backward: mean over phases, least in parentheses. The basin of the tree are '
@@ -422,13 +428,13 @@ def main() -> None:
     for orbit in orbits:
         tree_rows += tree_pushes(tree, orbit)
         write(False)
+    phases += [*phase_rows(orbits[1]), '', costs(orbits[1])]
+    write(False)
     for orbit in orbits:
         laws = rivals(orbit)
         for name in ('event', 'over phase', 'transverse'):
             distance.append(far(name, laws[name], orbit, FAR_ROBOTS))
             write(False)
-    phases += [*phase_rows(orbits[1]), '', costs(orbits[1])]
-    write(False)
     for orbit in orbits:
         distance.append(far('tree', Trees(orbit.speed, tree), orbit, TREE_ROBOTS))
         write(False)
