@@ -1,12 +1,14 @@
 """Learning from walking: hidden effects named from walks, and walking with what was named.
 
-    ./cg exec python bench/walking_learn.py --write bench/results/walking_learn.md (10 min CPU)
+    ./cg exec python bench/walking_learn.py --write bench/results/walking_learn.md
+    ... --masses --cases payload --seconds 7 --speeds 0.2 0.25 --springs 5
+    ... --masses --cases foot_slip --seconds 9 --speeds 0.3 0.3
 
 The robot walks under the tree that was planned for the nominal model, in the lock-step loop with
-noise, encoder counts and the observer; two or four such records are all that the diagnosis gets.
-A second part hides more than the nominal tree bears. It falls, the falls are recorded, and a tree
-for the diagnosed model walks instead. CPU times are of one process. `--raw` keeps every row, and
-the table is made of all rows there.
+noise, encoder counts and the observer; two or four such records are all that the diagnosis gets,
+unless `--springs` adds some. A second part hides more than the nominal tree bears. It falls, the
+falls are recorded, and a tree for the diagnosed model walks instead. CPU times are of one process.
+`--raw` keeps every row, and the table is made of all rows there.
 """
 
 import argparse
@@ -35,8 +37,11 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.high_gain import HighGainObserver
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Diagnosis, Options
+from cg_sysid.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments import load_experiment
 from cg_sysid.phases import Cut, cut_steps
 from cg_sysid.record import Record
+from cg_sysid.rehearse import rehearse
 
 NOMINAL = Model.load(model_path('compass_gait_mit'))
 T, EPSILON = 0.002, 0.01  # s
@@ -109,13 +114,27 @@ def robot_of(effect: str, values: dict, seed: int) -> Model:
         return robot.with_effect(effect, at, **values) if values else robot
 
 
-def recorded(walker: Walker, robot: Model, seconds: float, seed: int, count: int) -> list[Record]:
+def recorded(
+    walker: Walker, robot: Model, seconds: float, seed: int, speeds: list[float]
+) -> list[Record]:
     """Walks at several speeds, from either leg."""
     records = []
-    for k in range(count):
+    for k, speed in enumerate(speeds):
         leg = STANCES[k % 2]
-        run = walker.walk(robot, SPEEDS[k % len(SPEEDS)], seconds, 100 * seed + k, leg)
+        run = walker.walk(robot, speed, seconds, 100 * seed + k, leg)
         records.append(record_of(f'walk_{k}', run, Setup(stance=leg, on_blocks=False)))
+    return records
+
+
+def on_springs(robot: Model, seconds: float, seed: int) -> list[Record]:
+    """One record on either leg; springs of known stiffness measure what a walk cannot."""
+    records = []
+    for leg in STANCES:
+        e = load_experiment(f'spring_stabilised_{leg}')
+        signal = make_signal(ExcitationSettings(**e.excitation, duration=seconds, seed=seed))
+        records.append(
+            rehearse(f'springs_{leg}', robot, e.setup, e.initial_state, [signal], seconds, T, seed)
+        )
     return records
 
 
@@ -137,11 +156,14 @@ def causes_of(found: Diagnosis) -> str:
 def named(walker: Walker, effect: str, options: argparse.Namespace, seed: int) -> dict:
     """What a diagnosis says of walks."""
     robot = robot_of(effect, HIDDEN[effect], seed)
-    records = recorded(walker, robot, options.seconds, seed, options.records)
+    records = recorded(walker, robot, options.seconds, seed, options.speeds)
+    records += on_springs(robot, options.springs, seed) if options.springs else []
     began = time.process_time()
     cut, found = diagnosed(records, None if options.library else EFFECTS)
     return {
         'part': 'named', 'hidden': effect, 'seed': seed, 'library': options.library,
+        'springs': options.springs,
+        'at': options.speeds,
         'walked': round(sum(r.duration for r in records), 1), 'steps': len(cut.landings),
         'verdict': found.verdict, 'named': causes_of(found),
         'causes': [c.label for c in found.causes],
@@ -158,7 +180,7 @@ def fares(walker: Walker, robot: Model, speed: float, seed: int) -> int:
 def better(nominal: Walker, mass: float, options: argparse.Namespace, seed: int) -> dict:
     """Steps with the tree of the nominal, the diagnosed and the true model."""
     robot = robot_of('payload', {'mass': mass, 'distance': 0.6}, seed)
-    records = recorded(nominal, robot, options.seconds, seed, options.records)
+    records = recorded(nominal, robot, options.seconds, seed, options.speeds)
     row = {
         'part': 'better', 'mass': mass, 'seed': seed,
         'walked': round(sum(r.duration for r in records), 1), 'speeds': list(options.fresh),
@@ -186,15 +208,20 @@ def table(rows: list[dict], command: str) -> str:
     lines += [
         f'Robots whose numbers are up to {ERROR:.0%} off walk under the tree of the nominal '
         'model. "few": '
-        f'{len(EFFECTS)} effects are tried ({", ".join(EFFECTS)}); "all": the whole library.', '',
-        '| hidden | robot | library | s recorded | steps | verdict | named | s CPU |',
-        '|---|---:|---|---:|---:|---|---|---:|',
+        f'{len(EFFECTS)} effects are tried ({", ".join(EFFECTS)}); "all": the whole library.',
+        '',
+        '| hidden | robot | library | speeds, m/s | s recorded | of these on springs | steps '
+        '| verdict | named | s CPU |',
+        '|---|---:|---|---|---:|---:|---:|---|---|---:|',
         *(
-            f'| {r["hidden"]} | {r["seed"]} | {"all" if r["library"] else "few"} | {r["walked"]} '
-            f'| {r["steps"]} | {r["verdict"]} | {r["named"]} | {r["cpu"]} |'
+            f'| {r["hidden"]} | {r["seed"]} | {"all" if r["library"] else "few"} '
+            f'| {", ".join(f"{v:g}" for v in r["at"])} | {r["walked"]} '
+            f'| {2 * r.get("springs", 0):g} | {r["steps"]} | {r["verdict"]} | {r["named"]} '
+            f'| {r["cpu"]} |'
             for r in own
-        ), '',
-    ]  # fmt: skip
+        ),
+        '',
+    ]
     own = [r for r in rows if r['part'] == 'better']
     if own:
         lines += [
@@ -226,8 +253,12 @@ def main() -> None:
     parser.add_argument('--masses', type=float, nargs='*', default=[2.0], help='kg')
     parser.add_argument('--seeds', type=int, nargs='+', default=[1])
     parser.add_argument('--seconds', type=float, default=12.0, help='of each record')
-    parser.add_argument('--records', type=int, default=4)
+    parser.add_argument('--speeds', type=float, nargs='+', default=[0.2, 0.25, 0.3, 0.2],
+                        help='of the records, m/s')  # fmt: skip
     parser.add_argument('--fresh', type=float, nargs='+', default=[0.2, 0.3], help='m/s')
+    parser.add_argument(
+        '--springs', type=float, default=0.0, help='s of a record on springs on each leg besides'
+    )
     parser.add_argument('--library', action='store_true', help='try every effect')
     parser.add_argument('--raw', type=Path, default=Path('bench/results/walking_learn.jsonl'))
     parser.add_argument('--write', type=Path)
@@ -241,7 +272,9 @@ def main() -> None:
             with options.raw.open('a') as raw:
                 raw.write(json.dumps(row) + '\n')
     rows = [json.loads(line) for line in options.raw.read_text().splitlines()]
-    text = table(rows, 'python bench/walking_learn.py')
+    text = table(
+        rows, 'python bench/walking_learn.py --write FILE, with the options that its head lists'
+    )
     print(text)
     if options.write:
         write_atomically(options.write, text)
