@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_bringup.balancing import balance
+from cg_bringup.balancing import balance, record_of
 from cg_control.balance import BalanceController, BalanceSettings, balance_gains
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
@@ -47,10 +47,7 @@ def balancing(robot: Model) -> Record:
     pushes = [(2.0 * k + 0.99, 0.5 * (-1) ** k) for k in range(10)]
     run = balance(plant, HighGainObserver(RIGID, setup, 0.1), controller, LENGTH, pushes)
     assert run.upright(LENGTH)
-    stamps = 10**9 + np.round(run.time * 1e9).astype(np.int64)
-    return Record(
-        'balancing', stamps, {'hip_torque': run.torque}, run.readings, 'compass_gait', setup
-    )
+    return record_of('balancing', run, setup)
 
 
 def on_springs(robot: Model, seed: int) -> Record:

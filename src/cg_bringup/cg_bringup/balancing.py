@@ -13,10 +13,13 @@ import numpy as np
 from cg_control.balance import BALANCING, BalanceController
 from cg_control.recovery import TreeController
 from cg_dynamics.errors import SimulationError
+from cg_dynamics.mechanisms import CompassGait
 from cg_dynamics.plant import Plant
-from cg_dynamics.rig import STANCES
+from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimator
 from cg_hardware.safety import GateSettings, TorqueGate
+from cg_sysid.raw import NOTE_FORMAT
+from cg_sysid.record import NS_PER_S, Record
 
 FALLEN = 0.6  # rad of the stance leg: nothing catches the robot from there
 
@@ -111,6 +114,28 @@ def balance(
         np.array([mode == BALANCING for mode in modes]),
         np.array(legs),
     )
+
+
+def record_of(name: str, run: BalanceRun, setup: Setup) -> Record:
+    """What a recorder would have kept of a run: readings, the latched torque, and a note.
+
+    Args:
+        name: Of the record.
+        run: At least two samples long.
+        setup: Names the leg that stood at the start; the steps are in the data.
+    """
+    stamps = np.round(run.time * NS_PER_S).astype(np.int64)
+    note = {
+        'format': NOTE_FORMAT,
+        'experiment': name,
+        'mechanism': CompassGait.name,
+        'setup': setup.to_dict(),
+        'nominal_rate_hz': float(1.0 / np.median(np.diff(run.time))),
+        'initial_state': 'moving',
+        'closed_loop': True,
+    }
+    torques = {CompassGait.inputs[0]: run.torque}
+    return Record(name, stamps, torques, run.readings, CompassGait.name, setup, note)
 
 
 def power_above(torque: np.ndarray, sample_time: float, frequency: float) -> float:

@@ -94,11 +94,11 @@ def landings(done):
 
 def test_it_steps_in_walks_and_stands_again(walker):
     controller = walker(speed=0.3, steps=6)
-    done = run(controller, 17.0)
-    assert done.upright(17.0)
+    done = run(controller, 19.0)
+    assert done.upright(19.0)
     at = landings(done)
-    # The way back to upright leads over slower orbits, a step or two each.
-    assert 6 <= len(at) <= 12
+    # The way back to upright leads over two slower orbits, two to four steps each.
+    assert 6 <= len(at) <= 14
     # 0.3 m/s in steps of 0.3 m; one leg's step takes longer than the other's.
     assert (at[6] - at[4]) / 2 == pytest.approx(1.0, abs=0.1)
 
@@ -125,8 +125,8 @@ HIDDEN = {
 @pytest.mark.parametrize('hidden', HIDDEN)
 def test_it_walks_on_with_what_nobody_told_it(walker, hidden):
     controller = walker(speed=0.3, steps=6)
-    done = run(controller, 14.0, **HIDDEN[hidden])
-    assert done.upright(14.0)
+    done = run(controller, 19.0, **HIDDEN[hidden])
+    assert done.upright(19.0)
     assert len(landings(done)) >= 6
 
 

@@ -143,7 +143,10 @@ def _instant(
     earliest = max(last + QUICKEST if last else FINE_S, known - BACK_S)
     for end in np.arange(latest, earliest, -FINE_S):
         begin = max(end - LOOK_S, last)
-        if pieces.misfit(stance, begin, end) < limit:
+        old = pieces.misfit(stance, begin, end)
+        # With much missing in the model the limit is wide, and a piece from after the touchdown
+        # may be within it.
+        if old < limit and old <= RATHER * max(1.0, pieces.misfit(other(stance), begin, end)):
             break
     else:
         return None
