@@ -92,7 +92,8 @@ def draw_portrait(target: Path) -> None:
             shown = leg if role == 'stance leg' else 1 - leg
             pick = np.eye(4)[[shown, 2 + shown]]
             # At an impact itself hardly anything is left to be lost.
-            for node in on[~nodes.impact[on]]:
+            # The tube of the swing leg is wider than the picture.
+            for node in on[~nodes.impact[on]] if role == 'stance leg' else ():
                 E = frame(nodes.surfaces[node, 0])
                 # z'(E'FE)z <= 1, seen along the other two states.
                 share = pick @ E @ np.linalg.inv(E.T @ nodes.F[node] @ E) @ E.T @ pick.T
@@ -117,8 +118,8 @@ def draw_portrait(target: Path) -> None:
                  ylim=(low[1] - room[1], high[1] + room[1]))  # fmt: skip
     panels[0].legend(fontsize=8, loc='upper center')
     figure.suptitle(
-        f'{tree.speeds[orbit]:g} m/s: the orbit, what its tube holds on the transversal surface '
-        'of each knot,\nand a walk with observer and noise (dots)', fontsize=9,
+        f'{tree.speeds[orbit]:g} m/s: the orbit, what its tube holds of the stance leg on the '
+        'surface of each knot,\nand a walk with observer and noise (dots)', fontsize=9,
     )  # fmt: skip
     figure.savefig(target, dpi=DPI)
 
