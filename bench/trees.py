@@ -25,7 +25,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from cg_control.collocation import Options, optimise, planning_model
+from cg_control.collocation import Options, PlanningError, optimise
 from cg_control.extension import Extension
 from cg_control.grow_tree import BOX, upright_tree
 from cg_control.growth import Region
@@ -151,7 +151,7 @@ def build_lines(nodes: Nodes) -> list[str]:
 
 def procedure_lines(count: int) -> list[str]:
     """What one drawn state costs that nothing claims: by the text's procedure, and by ours."""
-    tree, plant = upright_tree(ROBOT), planning_model(ROBOT, False)
+    tree = upright_tree(ROBOT)
     extension, region = Extension(ROBOT), Region(np.array(BOX))
     legs, x = region.draw(np.random.default_rng(9), count)
 
@@ -160,8 +160,8 @@ def procedure_lines(count: int) -> list[str]:
         for leg, x0 in zip(legs, x, strict=True):
             order = STANCES if leg == 0 else STANCES[::-1]
             for modes in (order[:1], order):
-                with contextlib.suppress(ValueError):
-                    motion = optimise(plant, Task(modes, Box.point(x0)), Options())
+                with contextlib.suppress(PlanningError):
+                    motion = optimise(ROBOT, Task(modes, Box.point(x0)), Options(), False)
                     followed = stabilise(motion, ROBOT)
                     nodes = Nodes.of(followed, ROBOT)
                     tracker = Tracker(nodes, ROBOT)

@@ -158,6 +158,8 @@ class Grower:
         settings: The law that follows the tree.
         simulation: Options of the rollouts.
         threads: Of the rollouts; the tree is the same with any number.
+        turns: Displacements under which a state is the same, as those of `Lookup`, shape (m, nx);
+            None: there are none. Previews know of none.
         counts: So far.
         rounds: Finished.
     """
@@ -170,12 +172,13 @@ class Grower:
     settings: TrackingSettings = field(default_factory=TrackingSettings)
     simulation: WalkOptions = LANDING
     threads: int = 1
+    turns: np.ndarray | None = None
     counts: Counts = field(default_factory=Counts)
     rounds: int = 0
 
     def __post_init__(self):
         self.levels = Levels.of(self.options.tolerated, self.tree.nodes.rho)
-        self._lookup = Lookup(self.tree.nodes)
+        self._lookup = Lookup(self.tree.nodes, self.turns)
         self._first = 0
 
     @property
@@ -253,7 +256,8 @@ class Grower:
             claimed = np.flatnonzero(depth <= 1.0)
             if not len(claimed):
                 break
-            home = self.bring_home(node[claimed], x[open_[claimed]])
+            at = self._lookup.turned(node[claimed], x[open_[claimed]])
+            home = self.bring_home(node[claimed], at)
             self.counts.covered += int(home.sum())
             self.counts.false_claims += int((~home).sum())
             for k in claimed[~home]:
@@ -338,10 +342,11 @@ class Grower:
             branch.trajectory, self.model, branch.onto, branch.elapsed, funnels=branch.funnels
         )
         self._take(nodes)
-        if self.bring_home(np.array([nodes.first]), x[None])[0]:
+        first = np.array([nodes.first])
+        if self.bring_home(first, self._lookup.turned(first, x[None]))[0]:
             return True
         self.tree, self.levels = before
-        self._lookup = Lookup(self.nodes)
+        self._lookup = Lookup(self.nodes, self.turns)
         self.counts.rejected += 1
         return False
 
@@ -349,7 +354,7 @@ class Grower:
         self._first = len(self.nodes)
         self.tree = replace(self.tree, nodes=nodes)
         self.levels = self.levels.extended(len(nodes))
-        self._lookup = Lookup(nodes)
+        self._lookup = Lookup(nodes, self.turns)
 
     def _probe(self, new: np.ndarray, rng: np.random.Generator) -> None:
         """Try the funnels of nodes that nothing has cut with states drawn around them."""

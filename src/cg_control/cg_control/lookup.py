@@ -10,6 +10,9 @@ best node is the one at which the state is least deep.
 
 Nodes from which nothing is claimed (rho is zero: late references, funnels cut to nothing) take no
 part.
+
+A joint without stops is the same after a whole turn, and the tree is one in its unrolled angle: a
+state is then looked up at every *turn*, and claimed at the one at which it is least deep.
 """
 
 import math
@@ -55,11 +58,14 @@ class Lookup:
 
     Args:
         nodes: The tree. Its rho may be written afterwards; `refresh` takes it over.
+        turns: Displacements under which a state is the same, zero left out, shape (m, nx); None:
+            there are none. `best` looks at a state where it is.
     """
 
-    def __init__(self, nodes: Nodes):
+    def __init__(self, nodes: Nodes, turns: np.ndarray | None = None):
         self.nodes = nodes
         nx = nodes.x0.shape[1]
+        self.turns = np.zeros((0, nx)) if turns is None else turns
         self._i, self._j = np.triu_indices(nx)
         self._features = np.ones(len(self._i) + nx + 1)
         self._squares, self._linear = len(self._i), slice(len(self._i), len(self._i) + nx)
@@ -99,7 +105,7 @@ class Lookup:
     def best_of_many(
         self, leg: np.ndarray, x: np.ndarray, but: Sequence[Sequence[int]] = ()
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As `best`, for many states.
+        """As `best`, for many states, at every turn of them.
 
         Args:
             leg: Shape (B,).
@@ -109,6 +115,25 @@ class Lookup:
         Returns:
             Nodes (B,), -1 for none, and depths (B,).
         """
+        node, depth = self._best_where_they_are(leg, x, but)
+        for turn in self.turns:
+            other, less = self._best_where_they_are(leg, x + turn, but)
+            node, depth = np.where(less < depth, other, node), np.minimum(less, depth)
+        return node, depth
+
+    def turned(self, node: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """States (B, nx), each at the turn at which it is least deep at its node (B,)."""
+        if not len(self.turns):
+            return x
+        at = np.concatenate([x[:, None], x[:, None] + self.turns], axis=1)
+        away = at - self.nodes.x0[node][:, None]
+        costs = np.einsum('bti,bij,btj->bt', away, self.nodes.F[node], away)
+        return at[np.arange(len(x)), costs.argmin(axis=1)]
+
+    def _best_where_they_are(
+        self, leg: np.ndarray, x: np.ndarray, but: Sequence[Sequence[int]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `best_of_many`, at no turn but their own."""
         node, depth = np.full(len(leg), -1), np.full(len(leg), math.inf)
         for number, (index, matrix) in enumerate(zip(self._index, self._matrix, strict=True)):
             rows = np.flatnonzero(leg == number)

@@ -183,7 +183,8 @@ class _Work:
         count, nl = len(start), nodes.x0.shape[1]
         self.nodes, self.goal, self.samples = nodes, goal, samples
         self.p = np.ascontiguousarray(p)
-        self.x, self.elapsed, self.node = np.array(x), elapsed, start.copy()
+        # C reads rows, whatever order they came in.
+        self.x, self.elapsed, self.node = np.array(x, order='C'), elapsed, start.copy()
         self.stance = np.ascontiguousarray(nodes.stance[start], np.int32)
         self.outcome, self.impacts = np.zeros((2, count), np.int32)
         self.time = np.zeros(count)
@@ -291,7 +292,6 @@ class _Work:
         if self.nodes.stance[node] != leg and self.nodes.landing[node] < 0:
             return Outcome.LEFT
         return Outcome.TIMED_OUT if tick >= self.samples[b] else 0
-
 
     def _arrived(self, leg: int, motion: np.ndarray, tracker: Tracker) -> bool:
         node, way = tracker.node, self.nodes.ways[tracker.node]

@@ -198,21 +198,21 @@ def riccati(
     Args:
         design: Model to linearise.
         phase: With n knots.
-        Q: Shape (4, 4).
+        Q: Shape (nx, nx).
         R: Shape (1, 1).
-        S: At the end of the phase, shape (4, 4).
+        S: At the end of the phase, shape (nx, nx).
 
     Returns:
-        Gains K, shape (n, 4), and costs to go S, shape (n, 4, 4), at the knots.
+        Gains K, shape (n, nx), and costs to go S, shape (n, nx, nx), at the knots.
     """
     h = np.diff(phase.time)
     first, second = (_between(phase, share) for share in GAUSS)
     x = np.vstack([first[0], second[0], phase.states])
     u = np.concatenate([first[1], second[1], phase.torque])
     A, B = linearised(design, phase.stance, x, u)
-    n = len(h)
+    n, nx = len(h), x.shape[1]
     flows = hamiltonian_flows(
-        h, A[: 2 * n].reshape(2, n, 4, 4), B[: 2 * n].reshape(2, n, 4, 1), Q, R
+        h, A[: 2 * n].reshape(2, n, nx, nx), B[: 2 * n].reshape(2, n, nx, 1), Q, R
     )
     costs = costs_backward(flows, S)
     gains = (np.linalg.inv(R) @ B[2 * n :].transpose(0, 2, 1) @ costs)[:, 0, :]
@@ -278,14 +278,14 @@ def _between(phase: Phase, share: float) -> tuple[np.ndarray, np.ndarray]:
 def linearised(
     design: Model, stance: str, x: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A (n, 4, 4) and B (n, 4, 1) at n states (n, 4) and torques (n,)."""
+    """A (n, nx, nx) and B (n, nx, 1) at n states (n, nx) and torques (n,)."""
     setup = Setup(stance=stance)
     function = _mapped(compile_model(design, setup), len(x))
     A, B = function(x.T, u[None, :], parameter_vector(design, setup))
-    n = len(x)
+    n, nx = x.shape
     # Columns stand side by side, one state's matrix after the other.
-    A = np.asarray(A).reshape(4, n, 4).transpose(1, 0, 2)
-    return A, np.asarray(B).T.reshape(n, 4, 1)
+    A = np.asarray(A).reshape(nx, n, nx).transpose(1, 0, 2)
+    return A, np.asarray(B).T.reshape(n, nx, 1)
 
 
 @functools.cache

@@ -275,6 +275,14 @@ def test_machine_without_feet(compiled, monkeypatch):
     assert arrived.time[5] == 0
 
 
+def test_states_may_be_stored_by_columns(robot, tree):
+    start = np.full(20, tree.first)
+    x = drawn(tree, start, seed=14)
+    found = follow(tree, robot, start, x, 0.5)
+    again = follow(tree, robot, start, np.asfortranarray(x), 0.5)
+    np.testing.assert_array_equal(again.state, found.state)
+
+
 def test_no_rollouts_are_no_error(robot, tree):
     found = follow(tree, robot, np.zeros(0, int), np.zeros((0, 4)), 1.0, visits=3)
     assert found.state.shape == (0, 4)
