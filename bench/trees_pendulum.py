@@ -140,8 +140,8 @@ def line(first: str, row: tuple, count: int) -> str:
 
 def span(values) -> str:
     """The least, the median and the largest."""
-    low, middle, high = np.min(values), np.median(values), np.max(values)
-    return f'{low:.4g} / {middle:.4g} / {high:.4g}'
+    three = np.min(values), np.median(values), np.max(values)
+    return ' / '.join(f'{value:.4g}' if value < 1e4 else f'{value:.0f}' for value in three)
 
 
 def main() -> None:
