@@ -83,17 +83,20 @@ def census_states() -> np.ndarray:
     return BOX * (2 * (cells + rng.random(cells.shape)) / CELLS - 1)
 
 
-def census(grown: Grower, x: np.ndarray) -> tuple[int, int]:
-    """How many of the states are claimed, and how many of these claims are true."""
+def claims(grown: Grower, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the states (B, 2) are claimed, and which of the claims are true, (B,) each."""
     nodes = grown.nodes
     lookup = Lookup(nodes, TURNS)
     node, depth = lookup.best_of_many(np.zeros(len(x), int), x)
-    node, x = node[depth <= 1.0], x[depth <= 1.0]
+    claimed = depth <= 1.0
+    at = lookup.turned(node[claimed], x[claimed])
     done = follow(
-        nodes, MODEL, node, lookup.turned(node, x), nodes.to_go[node] + AT_HOME,
+        nodes, MODEL, node[claimed], at, nodes.to_go[node[claimed]] + AT_HOME,
         goal=grown.tree.goal, options=JUDGED,
     )  # fmt: skip
-    return len(node), int((done.outcome == Outcome.ARRIVED).sum())
+    true = np.zeros(len(x), bool)
+    true[claimed] = done.outcome == Outcome.ARRIVED
+    return claimed, true
 
 
 def wilson(hits: int, of: int) -> tuple[float, float]:
@@ -123,7 +126,7 @@ def grow(seed: int, tolerated: float, intervals: int, x: np.ndarray, shown: tupl
             streak = growing.counts.samples
         if growing.counts.samples in shown:
             paused = time.process_time()
-            counts, found = growing.counts, census(growing, x)
+            counts, found = growing.counts, [int(some.sum()) for some in claims(growing, x)]
             rows.append((counts.samples, counts.grown, len(growing.nodes), *found, paused - began))
             began += time.process_time() - paused
     return rows, streak

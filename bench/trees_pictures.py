@@ -1,10 +1,11 @@
-"""Pictures of the tree that comes along: slices of what it brings home, growth, a recovery.
+"""Pictures of trees: slices of what one brings home, growth, a recovery, a pendulum's.
 
-    python bench/trees_pictures.py [slices] [growth] [recovery]
+    python bench/trees_pictures.py [slices] [growth] [recovery] [pendulum]
 
 They go to docs/images; without names, all of them. *Slices* preview every state of a grid on the
 nominal robot. *Growth* draws the table of results/trees_growth.md. *Recovery* is the loop of
-bench/trees_live.py, with observer and noise, of a robot that is pushed twice.
+bench/trees_live.py, with observer and noise, of a robot that is pushed twice. *Pendulum* grows the
+tree of bench/trees_pendulum.py and judges a grid of states as there.
 """
 
 import argparse
@@ -21,6 +22,8 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withTickedStroke
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter, StrMethodFormatter
 from trees_live import EPSILONS, MODEL, RESULT, in_the_loop
+from trees_pendulum import BOX as PENDULUM_BOX
+from trees_pendulum import claims, grower
 
 from cg_bringup.recover_run import RecoverOptions
 from cg_control.grow_tree import BOX
@@ -39,6 +42,7 @@ GRID = 81  # states along an edge of a slice
 LEAN = 0.1  # rad, of the slices through the swing leg's motion
 SLOW = 3.0  # s: end of the colours
 DPI = 120
+DRAWN = (32, 128, 512, 8192)  # states that the pendulum's tree has seen
 ORANGE, BLUE, BLACK = '#d55e00', '#0072b2', 'black'  # told apart by the colour-blind
 TICKS = withTickedStroke(spacing=14, angle=-90, length=0.4)  # where the values are smaller
 PUSHES = ((0.5, 5.0), (2.75, 5.0))  # s, N s
@@ -280,10 +284,46 @@ def draw_recovery(target: Path) -> None:
     save(target, figure, motion, legs, plot, shown)
 
 
+def draw_pendulum(target: Path) -> None:
+    """What the tree of the pendulum claims while it grows, in the unrolled angle of one turn."""
+    growing = grower(seed=0, tolerated=0.0, intervals=40)
+    angle, rate = (np.linspace(-half, half, 2 * GRID) for half in PENDULUM_BOX)
+    x = np.stack(np.meshgrid(angle, rate), axis=-1)
+    figure, panels = pyplot.subplots(
+        2, 2, figsize=(9.0, 6.4), layout='constrained', sharex=True, sharey=True
+    )
+    for drawn, axes in zip(DRAWN, panels.flat, strict=True):
+        while growing.counts.samples < drawn:
+            growing.round()
+        claimed, true = (some.reshape(x.shape[:2]) for some in claims(growing, x.reshape(-1, 2)))
+        axes.contourf(angle, rate, true, [0.5, 1.5], colors=[BLUE], alpha=0.35)
+        axes.contourf(angle, rate, claimed & ~true, [0.5, 1.5], colors=[ORANGE])
+        nodes = growing.nodes
+        for branch in range(1, nodes.branches + 1):
+            q, v = nodes.x0[nodes.branch == branch].T
+            wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+            wrapped[1:][np.abs(np.diff(wrapped)) > np.pi] = np.nan
+            axes.plot(wrapped, v, color='0.2', linewidth=0.9)
+        axes.set(xlim=(angle[0], angle[-1]), ylim=(rate[0], rate[-1]))
+        axes.set_title(f'{drawn} states drawn, {nodes.branches} branches', fontsize=10)
+    figure.supxlabel('angle from upright, rad')
+    figure.supylabel('rate, rad/s')
+    figure.legend(
+        handles=[
+            Patch(facecolor=BLUE, alpha=0.35, label='claimed, and comes home'),
+            Patch(facecolor=ORANGE, label='claimed falsely'),
+            Line2D([], [], color='0.2', label='branches'),
+        ],
+        loc='outside upper center', ncols=3, frameon=False, fontsize=9,
+    )  # fmt: skip
+    figure.savefig(target, dpi=DPI)
+
+
 PICTURES = {
     'slices': (draw_slices, 'tree_slices.png'),
     'growth': (draw_growth, 'tree_growth.png'),
     'recovery': (draw_recovery, 'recovery.gif'),
+    'pendulum': (draw_pendulum, 'tree_pendulum.png'),
 }
 
 
