@@ -28,6 +28,7 @@ import platform
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,7 @@ LET_GO = 1.2  # depth in the basin at which the one-step rebalance begins
 IMPULSES = (3.0, 4.0)  # N s
 CONTROLLERS = ('balance', 'rebalance', 'funnels', 'previews')
 PAYLOADS = (('inner', 1.5, 0.4), ('inner', 1.2, 0.9), ('outer', 0.8, 0.7), ('outer', 2.0, 0.3))
+BELIEFS = ('nominal', 'diagnosed', 'true')
 RESULT = Path(__file__).parent / 'results' / 'trees_robust.md'
 MODEL = Model.load(model_path('compass_gait_mit'))
 
@@ -117,7 +119,7 @@ CONDITIONS = (
     *(
         Condition(f'{mass:g} kg on the {leg} pair, {height:g} m, {what}',
                   payload=(leg, mass, height), belief=what)
-        for leg, mass, height in PAYLOADS for what in ('nominal', 'diagnosed', 'true')
+        for leg, mass, height in PAYLOADS for what in BELIEFS
     ),
 )  # fmt: skip
 
@@ -275,6 +277,11 @@ def fares(job: tuple[int, str, str, int, int]) -> bool:
     return came_home(balance(plant, observer, controller, DURATION, pushes))
 
 
+def row_of(words: str, hits: np.ndarray, of: int) -> str:
+    """A row of the table: how many came home, by controller, of starts and then of pushes."""
+    return f'| {words} | ' + ' | '.join(share(int(one), of) for one in hits) + ' |'
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--robots', type=int, default=40, help='starts, and pushes, of a row')
@@ -295,14 +302,17 @@ def main() -> None:
     with ProcessPoolExecutor(
         options.workers, multiprocessing.get_context('spawn'), take_diagnosed, (DIAGNOSED,)
     ) as pool:
+        hits = np.zeros((len(CONDITIONS), 2 * len(CONTROLLERS)), int)
         for number, condition in enumerate(CONDITIONS):
-            cells = []
-            for kind in ('start', 'push'):
-                for name in CONTROLLERS:
-                    jobs = [(number, name, kind, k, count) for k in range(count)]
-                    cells.append(share(sum(pool.map(fares, jobs, chunksize=4)), count))
-            lines.append(f'| {condition.words} | ' + ' | '.join(cells) + ' |')
+            for column, (kind, name) in enumerate(product(('start', 'push'), CONTROLLERS)):
+                jobs = [(number, name, kind, k, count) for k in range(count)]
+                hits[number, column] = sum(pool.map(fares, jobs, chunksize=4))
+            lines.append(row_of(condition.words, hits[number], count))
             print(lines[-1], flush=True)
+    for belief in BELIEFS:
+        rows = [k for k, c in enumerate(CONDITIONS) if c.payload and c.belief == belief]
+        words = f'all {len(rows)} payloads, {belief}'
+        lines.append(row_of(words, hits[rows].sum(axis=0), count * len(rows)))
     text = '\n'.join([
         '# A tree against errors, noise, delay and payloads',
         '',
