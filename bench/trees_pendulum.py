@@ -2,7 +2,7 @@
 
     python bench/trees_pendulum.py [--seeds 10] [--write]
 
-The pendulum of the first LQR-trees (models/lqr_trees_pendulum.yaml: 1 kg at 0.5 m, 0.1 N m s/rad,
+The pendulum of the first LQR-trees (models/tedrake_pendulum.yaml: 1 kg at 0.5 m, 0.1 N m s/rad,
 3 N m where 4.9 hold it level), in their box: any angle, rates within 20 rad/s. Growth, funnels,
 look-up and rollouts are those of the robot that walks; motions are planned by swing_up.py, gains
 have the published Q = diag(10, 1) and R = 15. States are looked up at up to four whole turns
@@ -36,7 +36,7 @@ from cg_description.paths import model_path
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 
-MODEL = Model.load(model_path('lqr_trees_pendulum'))
+MODEL = Model.load(model_path('tedrake_pendulum'))
 BOX = np.array([np.pi, 20.0])  # rad, rad/s
 TURNS = whole_turns(joint=0, nx=2, most=4)
 SWING = SwingOptions(Q=np.diag([10.0, 1.0]), R=15.0)

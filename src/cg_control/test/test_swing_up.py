@@ -15,7 +15,7 @@ from cg_dynamics.c_compiler import compiler
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 
-PENDULUM = Model.load(model_path('lqr_trees_pendulum'))
+PENDULUM = Model.load(model_path('tedrake_pendulum'))
 SWING = SwingOptions(Q=np.diag([10.0, 1.0]), R=15.0, intervals=20)
 TURNS = whole_turns(joint=0, nx=2, most=1)
 REGION = Region(np.array([np.pi, 6.0]), legs=1)  # rad, rad/s
