@@ -85,9 +85,10 @@ def template(name: str) -> str:
 
 
 def example_of(body: Mechanism) -> Model:
-    """The plainest model of a mechanism that comes along."""
+    """The plainest model of a mechanism that comes along, of a machine with sensors."""
     models = [Model.load(path) for path in sorted(models_directory().glob('*.yaml'))]
-    return min((m for m in models if m.mechanism is body), key=lambda m: len(m.effects))
+    own = (model for model in models if model.mechanism is body)
+    return min(own, key=lambda model: (not model.sensors, len(model.effects)))
 
 
 def input_units(body: Mechanism) -> list[str]:
