@@ -84,7 +84,8 @@ def run(controller, duration, pushes=(), seed=2, robot=MODEL, rise=0.0):
     """From upright on the inner leg, with noise, quantisation and an observer."""
     setup = Setup(stance='inner', on_blocks=False)
     plant = Uneven(robot, setup, np.zeros(4), seed=seed)
-    plant.rise, plant.at = rise, 4
+    # On the outer leg: at 0.3 m/s the foot swings 95 mm above the ground there, 2 mm on the inner.
+    plant.rise, plant.at = rise, 5
     return balance(plant, HighGainObserver(MODEL, setup, 0.01), controller, duration, pushes)
 
 
@@ -97,10 +98,10 @@ def test_it_steps_in_walks_and_stands_again(walker):
     done = run(controller, 19.0)
     assert done.upright(19.0)
     at = landings(done)
-    # The way back to upright leads over two slower orbits, two to four steps each.
-    assert 6 <= len(at) <= 14
+    # It stops from the orbit that it is on: in the step that it is in, or the next one.
+    assert 6 <= len(at) <= 7
     # 0.3 m/s in steps of 0.3 m; one leg's step takes longer than the other's.
-    assert (at[6] - at[4]) / 2 == pytest.approx(1.0, abs=0.1)
+    assert (at[5] - at[3]) / 2 == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_push_does_not_stop_it(walker):
