@@ -30,9 +30,9 @@ from cg_control.grow_tree import AROUND, REGION
 from cg_control.nodes import Way
 from cg_control.preview import LANDING, Preview
 from cg_control.recovery import FOLLOWING, ReadyTree, RecoverySettings, TreeController
+from cg_control.tracking import WALKING
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.walking import WALKING
 from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
@@ -49,9 +49,7 @@ HELD = 0.5  # s in a tube that count as back
 EPSILON = 0.01  # s, of the observer
 RESULT = Path(__file__).parent / 'results' / 'walking_tree.md'
 MODEL = Model.load(model_path('compass_gait_mit'))
-ON_ORBITS = RecoverySettings(
-    remedy=WALKING.remedy, pull=WALKING.pull, fastest=WALKING.fastest
-)
+ON_ORBITS = RecoverySettings()
 GAINS = balance_gains(MODEL, ON_ORBITS, LANDING.sample_time)
 BASINS = shipped_basins(MODEL, GAINS, MODEL.torque_limit)
 

@@ -24,7 +24,7 @@ from cg_control.preview import LANDING
 from cg_control.rollouts import follow
 from cg_control.routes import UPRIGHT as STANDING
 from cg_control.task import UPRIGHT, Box, Goal, Stretch, Task
-from cg_control.tracking import TrackingSettings
+from cg_control.tracking import WALKING
 from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import stabilise_over_phase
 from cg_control.tree import Tree
@@ -38,9 +38,6 @@ log = logging.getLogger(__name__)
 # s by which a state in a tube may be off the surface of its phase: more than half of what lies
 # between two knots, so that tubes hold all of the orbit, and less than what leaves the orbit.
 LAG = 0.05
-
-# The phase is the projection on the surfaces, within what a robot can be faster or slower.
-WALKING = TrackingSettings(remedy='phase', pull=500.0, fastest=10.0)
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ from cg_control.orbit import plan_orbit
 from cg_control.preview import LANDING
 from cg_control.rollouts import Outcome, follow
 from cg_control.routes import UPRIGHT, Departure, Routes
-from cg_control.tracking import Tracker
+from cg_control.tracking import WALKING, Tracker
 from cg_control.trajectory import TrajectoryError
 from cg_control.tree import Tree, TreeError
 from cg_control.tree_files import tree_path
 from cg_control.walking import (
-    WALKING,
     TubeOptions,
     across,
     buried,
