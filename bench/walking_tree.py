@@ -1,4 +1,4 @@
-"""Robots that are pushed while they walk: the transverse LQR of an orbit alone, and trees.
+"""Robots that are pushed while they walk: the gains of an orbit alone, and trees.
 
     python bench/walking_tree.py [--tree FILE ...] [--phases 8] [--write]
 
@@ -9,7 +9,7 @@ and has not fallen; it walks *directly* if the balance controller has not held i
 and *by way of upright* otherwise. It *stands* if the balance controller holds it at the end. Steps
 are counted from the push to the first sample after which it is in a tube for half a second.
 
-`LQR alone` is the same controller on a tree of orbits without previews, that leaves no tube.
+`gains alone` is the same controller on a tree of orbits without previews, that leaves no tube.
 
 *Previews* are of states around the orbits, drawn as in the growth of a tree with another seed.
 """
@@ -76,7 +76,7 @@ def pushed(
         phase: At which the push comes, as a share of the period.
         impulse: N s.
         known: The state is known; otherwise observer and noise.
-        alone: LQR alone.
+        alone: The gains of the orbit alone.
         seed: Of the noise.
     """  # fmt: skip
     nodes = ready.tree.nodes
@@ -168,7 +168,7 @@ def main() -> None:
     options = parser.parse_args()
     trees = {Path(name).stem: Tree.load(tree_path(name), MODEL) for name in options.tree}
     first = next(iter(trees.values()))
-    laws = {'LQR alone': (ReadyTree.of(orbits_only(first), MODEL), True)}
+    laws = {'gains alone': (ReadyTree.of(orbits_only(first), MODEL), True)}
     laws |= {name: (ReadyTree.of(tree, MODEL), False) for name, tree in trees.items()}
     told = [f'{n}: {len(t.nodes)} nodes, {t.nodes.branches} branches' for n, t in trees.items()]
     lines = [
