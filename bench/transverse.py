@@ -19,7 +19,7 @@ import numpy as np
 from cg_control.collocation import planning_model
 from cg_control.orbit import plan_orbit
 from cg_control.surfaces import METHODS, UNITS, phase_of, tube, with_surfaces
-from cg_control.transverse import WALKING, monodromy, stabilise_transversely
+from cg_control.transverse import TRANSVERSE, monodromy, stabilise_transversely
 from cg_control.tvlqr import Weights, stabilise
 from cg_description.paths import model_path
 from cg_dynamics.hybrid import WalkOptions, walk
@@ -33,7 +33,7 @@ DEMANDS = (
 WALKED = ((0.25, 0.3), (0.25, 0.4), (0.3, 0.3))
 WEIGHTS = {
     'those of balance': Weights(),
-    'default': WALKING,
+    'default': TRANSVERSE,
     'even': Weights(100.0, 100.0, 11.0, 11.0, 1 / 100),
 }
 SIZES = (0.5, 1.0)

@@ -26,9 +26,9 @@ from cg_control.basin import sample_basin, shipped_basins
 from cg_control.collocation import PlanningError
 from cg_control.plan_walk import walking_tree
 from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.tracking import WALKING
 from cg_control.trajectory import TrajectoryError
 from cg_control.tree import Tree
-from cg_control.walking import WALKING
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

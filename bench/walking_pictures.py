@@ -20,7 +20,6 @@ from cg_control.recovery import ReadyTree, RecoverySettings
 from cg_control.transverse import frame
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.walking import WALKING
 from cg_dynamics.rig import STANCES
 
 IMAGES = Path(__file__).parents[1] / 'docs' / 'images'
@@ -34,10 +33,7 @@ DPI = 120
 def walked(speed: float, steps: int, duration: float, pushes):
     """The loop of one walk, and the tree."""
     tree = Tree.load(tree_path('compass_gait_mit_walk'), MODEL)
-    settings = RecoverySettings(
-        speed=speed, steps=steps, remedy=WALKING.remedy, pull=WALKING.pull,
-        fastest=WALKING.fastest,
-    )  # fmt: skip
+    settings = RecoverySettings(speed=speed, steps=steps)
     run, _ = in_the_loop(
         ReadyTree.of(tree, MODEL, 0.002), STANCES[0], np.zeros(4), EPSILONS[0], 2, pushes,
         settings, duration,

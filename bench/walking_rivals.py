@@ -15,7 +15,9 @@ within 1.5 times their nominal time; it fell at 0.6 rad of the stance or 2 rad o
     constraints    virtual constraints (hybrid zero dynamics), w = 20 /s
     transverse     transverse LQR on the widest surfaces
     flow           transverse LQR on surfaces normal to the motion
-    tree           `TreeController` with the shipped walking tree, its loop in Python
+    transverse, own   transverse LQR on surfaces that the cost to go asks for, between impact
+                   surfaces (`with_own_surfaces`), with the weights of TVLQR
+    tree           previews of the shipped walking tree; its loop has walking_conditions.py
     passive        no torque, no friction, down a slope
 
 *Basin*: states right after an impact, uniform in a box around the orbit: half the angle between
@@ -35,23 +37,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from flock import SAMPLE_TIME, Constrained, Flock, Following, Passive, Physics, pushed, walked
+from flock import Constrained, Flock, Following, Passive, Physics, pushed, walked
 from rebalance import wrong_robot
 
-from cg_control.balance import BalanceController, balance_gains
-from cg_control.basin import shipped_basins
 from cg_control.nodes import Nodes
 from cg_control.orbit import Orbit, plan_orbit
 from cg_control.preview import Preview
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
 from cg_control.surfaces import with_surfaces
-from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
-from cg_control.transverse import stabilise_over_phase, stabilise_transversely
+from cg_control.tracking import LEAST_TURN, WALKING, Tracker, TrackingSettings
+from cg_control.transverse import (
+    stabilise_over_phase,
+    stabilise_transversely,
+    with_own_surfaces,
+)
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.tvlqr import stabilise_periodically
+from cg_control.tvlqr import Weights, stabilise_periodically
 from cg_control.virtual_constraints import VirtualConstraints
-from cg_control.walking import WALKING
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.gait import find_gait
@@ -67,7 +69,7 @@ STARTS, ROBOTS = 300, 40
 IMPULSES = np.arange(0.5, 6.01, 0.5)
 PHASES = 8
 FAR, FAR_ROBOTS = 200, 20
-TREE_PUSHES, TREE_ROBOTS = (2.0, 4.0), 2
+FAR_LAWS = ('event', 'over phase', 'transverse, own')
 ORDER = ('basin', 'push', '3 mm', '6 mm', '1 cm', '-1 deg', '-0.5 deg', '0.5 deg', '1 deg', '5 %',
          '10 %', '2 ms', '4 ms', '8 ms', 'friction unknown', 'observer')  # fmt: skip
 RESULT = Path(__file__).parent / 'results' / 'walking_rivals.md'
@@ -101,6 +103,7 @@ def rivals(orbit: Orbit) -> dict:
         Nodes.orbit(stabilise_transversely(with_surfaces(motion, ROBOT, method), ROBOT), ROBOT)
         for method in ('widest', 'flow')
     )
+    between = stabilise_transversely(with_own_surfaces(motion, ROBOT), ROBOT, Weights())
     return {
         'clock': Following(over_time, ROBOT, TrackingSettings(remedy='clock')),
         'event': Following(over_time, ROBOT, TrackingSettings(remedy='event')),
@@ -108,6 +111,7 @@ def rivals(orbit: Orbit) -> dict:
         'constraints': Constrained(VirtualConstraints(motion, ROBOT), ROBOT),
         'transverse': Following(wide, ROBOT, WALKING),
         'flow': Following(flow, ROBOT, WALKING),
+        'transverse, own': Following(Nodes.orbit(between, ROBOT), ROBOT, WALKING),
     }
 
 
@@ -187,70 +191,16 @@ def rival_row(name: str, law, orbit: Orbit, names, flock: Flock, kind) -> dict[s
     return cells
 
 
-class Trees:
-    """As a law of flock.py: one `TreeController` for each robot."""
-
-    def __init__(self, speed: float, tree: Tree, preview: bool = True):
-        self.settings = RecoverySettings(
-            speed=speed, remedy=WALKING.remedy, pull=WALKING.pull, fastest=WALKING.fastest,
-            preview=preview,
-        )  # fmt: skip
-        self.tree, self.before = tree, None
-        self.gains = balance_gains(ROBOT, self.settings, SAMPLE_TIME)
-        self.basins = shipped_basins(ROBOT, self.gains, ROBOT.torque_limit)
-
-    def begin(self, flock: Flock) -> None:
-        """Before the first sample."""
-        self.controllers, self.ticks = [], 0
-        for b in range(len(flock)):
-            balance = BalanceController(ROBOT, self.settings, self.gains, self.basins)
-            one = TreeController(balance, self.settings)
-            one.take(ReadyTree.of(self.tree, ROBOT, SAMPLE_TIME))
-            if self.before is not None:
-                one.step(0, STANCES[flock.leg[b]], self.before[b])
-            self.controllers.append(one)
-
-    def torque(self, who, leg, x, taken, first: bool) -> np.ndarray:
-        """Torque of the robots `who`, (n,)."""
-        self.ticks += 1
-        now = round(self.ticks * SAMPLE_TIME * 1e9)
-        return np.array([
-            self.controllers[b].step(now, STANCES[s], y).torque
-            for b, s, y in zip(who, leg, x, strict=True)
-        ])  # fmt: skip
-
-
 def tree_basin(tree: Tree, orbit: Orbit) -> str:
     x = section(orbit.trajectory.states[0], STARTS, 1.0, 2022)
     found = Preview(tree, ROBOT, WALKING).choose(np.zeros(len(x), int), x)
     return interval(int((found >= 0).sum()), len(x))
 
 
-def tree_pushes(tree: Tree, orbit: Orbit) -> list[str]:
-    rows, physics, where = [], Physics(ROBOT), points(orbit, PHASES)
-    law = Trees(orbit.speed, tree)
-    for P in TREE_PUSHES:
-        cells = []
-        for sign in (1, -1):
-            flocks = [
-                Flock.of(physics, leg, pushed(ROBOT, STANCES[leg], x, sign * P), node)
-                for leg, node, x in where
-            ]
-            law.before = np.array([x for _, _, x in where])
-            # 6 s to come back, and by way of upright if need be.
-            done = walked(ROBOT, flocks[0].and_(*flocks[1:]), law, 8, 8 * orbit.period / 2 + 6.0)
-            cells.append(f'{(done.impacts >= 8).sum()} and {done.standing.sum()}')
-        rows.append(f'| {orbit.speed:.2f} | {P:g} | {" | ".join(cells)} |')
-        print('tree', rows[-1], flush=True)
-    return rows
-
-
 def far(name: str, law, orbit: Orbit, count: int) -> str:
     """200 steps with errors of 5 %, observer and noise."""
     flock = Flock.of(Physics(ROBOT), 0, section(orbit.trajectory.states[0], count, 0.0, 5))
     flock.p, flock.observed = wrong_parameters(0.05, count), np.ones(count, bool)
-    if isinstance(law, Trees):
-        law.before = None
     done = walked(ROBOT, flock, law, FAR, duration_of(orbit, FAR), known=ROBOT)
     row = (
         f'| {orbit.speed:.2f} | {name} | {(done.impacts >= FAR).sum()} of {count} '
@@ -367,7 +317,7 @@ def main() -> None:
         print(*phase_rows(orbit), '', costs(orbit), sep='\n')
         return
     began = time.process_time()
-    passive, table, distance, phases, tree_rows = passive_lines(), [], [], [], []
+    passive, table, distance, phases = passive_lines(), [], [], []
     tree = Tree.load(tree_path('compass_gait_mit_walk'), ROBOT)
     orbits = [plan_orbit(ROBOT, speed, STEP) for speed in SPEEDS]
 
@@ -396,13 +346,6 @@ def main() -> None:
             '|---:|---|---|---:|---:|',
             *distance,
             '',
-            f'The tree in the loop, pushed at {PHASES} phases: robots that made 8 steps, '
-            'and those that had not fallen within 6 s more than these take:',
-            '',
-            '| speed | push, N s | forward | backward |',
-            '|---:|---:|---|---|',
-            *tree_rows,
-            '',
             'Phase over 10 steps on the surfaces of `over phase`: robots of 10 that made them; '
             'then bias and standard deviation of how far the phase of the true state is ahead, '
             'ms, standard deviation of ds/dt, share of samples at which surfaces meet (lost):',
@@ -425,19 +368,14 @@ def main() -> None:
         rest = ' | '.join('' for _ in ORDER[1:])
         table.append(f'| {orbit.speed:.2f} | tree | {basin} | {rest} |')
         write(False)
-    for orbit in orbits:
-        tree_rows += tree_pushes(tree, orbit)
-        write(False)
-    phases += [*phase_rows(orbits[1]), '', costs(orbits[1])]
+    rows = [phase_rows(orbit) for orbit in orbits]
+    phases += [*rows[0], *(row for more in rows[1:] for row in more[2:]), '', costs(orbits[1])]
     write(False)
     for orbit in orbits:
         laws = rivals(orbit)
-        for name in ('event', 'over phase', 'transverse'):
+        for name in FAR_LAWS:
             distance.append(far(name, laws[name], orbit, FAR_ROBOTS))
             write(False)
-    for orbit in orbits:
-        distance.append(far('tree', Trees(orbit.speed, tree), orbit, TREE_ROBOTS))
-        write(False)
     write(True)
     print(f'{time.process_time() - began:.0f} s CPU')
 

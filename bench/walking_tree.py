@@ -1,4 +1,4 @@
-"""Robots that are pushed while they walk: the transverse LQR of an orbit alone, and trees.
+"""Robots that are pushed while they walk: the gains of an orbit alone, and trees.
 
     python bench/walking_tree.py [--tree FILE ...] [--phases 8] [--write]
 
@@ -9,7 +9,7 @@ and has not fallen; it walks *directly* if the balance controller has not held i
 and *by way of upright* otherwise. It *stands* if the balance controller holds it at the end. Steps
 are counted from the push to the first sample after which it is in a tube for half a second.
 
-`LQR alone` is the same controller on a tree of orbits without previews, that leaves no tube.
+`gains alone` is the same controller on a tree of orbits without previews, that leaves no tube.
 
 *Previews* are of states around the orbits, drawn as in the growth of a tree with another seed.
 """
@@ -30,9 +30,9 @@ from cg_control.grow_tree import AROUND, REGION
 from cg_control.nodes import Way
 from cg_control.preview import LANDING, Preview
 from cg_control.recovery import FOLLOWING, ReadyTree, RecoverySettings, TreeController
+from cg_control.tracking import WALKING
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.walking import WALKING
 from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
@@ -49,9 +49,7 @@ HELD = 0.5  # s in a tube that count as back
 EPSILON = 0.01  # s, of the observer
 RESULT = Path(__file__).parent / 'results' / 'walking_tree.md'
 MODEL = Model.load(model_path('compass_gait_mit'))
-ON_ORBITS = RecoverySettings(
-    remedy=WALKING.remedy, pull=WALKING.pull, fastest=WALKING.fastest
-)
+ON_ORBITS = RecoverySettings()
 GAINS = balance_gains(MODEL, ON_ORBITS, LANDING.sample_time)
 BASINS = shipped_basins(MODEL, GAINS, MODEL.torque_limit)
 
@@ -78,7 +76,7 @@ def pushed(
         phase: At which the push comes, as a share of the period.
         impulse: N s.
         known: The state is known; otherwise observer and noise.
-        alone: LQR alone.
+        alone: The gains of the orbit alone.
         seed: Of the noise.
     """  # fmt: skip
     nodes = ready.tree.nodes
@@ -170,7 +168,7 @@ def main() -> None:
     options = parser.parse_args()
     trees = {Path(name).stem: Tree.load(tree_path(name), MODEL) for name in options.tree}
     first = next(iter(trees.values()))
-    laws = {'LQR alone': (ReadyTree.of(orbits_only(first), MODEL), True)}
+    laws = {'gains alone': (ReadyTree.of(orbits_only(first), MODEL), True)}
     laws |= {name: (ReadyTree.of(tree, MODEL), False) for name, tree in trees.items()}
     told = [f'{n}: {len(t.nodes)} nodes, {t.nodes.branches} branches' for n, t in trees.items()]
     lines = [

@@ -23,7 +23,6 @@ from cg_bringup.runs import MODES, NOMINAL_MODEL, NodeOf
 from cg_bringup.verdict import walk_verdict
 from cg_control.tree import Tree, TreeError
 from cg_control.tree_files import tree_path
-from cg_control.walking import WALKING
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
@@ -87,10 +86,7 @@ def walk_nodes(options: WalkRunOptions) -> dict[str, NodeOf]:
     given = {name: getattr(options, name) for name in names}
     nodes_of = recover_nodes(RecoverOptions(start='upright', duration=duration, **given))
     nodes_of[MACHINE].parameters['experiment'] = 'walk'
-    nodes_of['tree_controller'].parameters.update(
-        speed=options.speed, steps=options.steps, remedy=WALKING.remedy, pull=WALKING.pull,
-        fastest=WALKING.fastest,
-    )  # fmt: skip
+    nodes_of['tree_controller'].parameters.update(speed=options.speed, steps=options.steps)
     return nodes_of
 
 

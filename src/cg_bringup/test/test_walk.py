@@ -27,7 +27,6 @@ from cg_control.tree import Tree, TreeError  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
 from cg_control.tree_files import tree_path  # noqa: E402
 from cg_control.tree_server_node import TreeServerNode  # noqa: E402
-from cg_control.walking import WALKING  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.model import Model  # noqa: E402
@@ -46,7 +45,6 @@ NODES = {
 }
 PATIENCE = 90.0  # s
 MODEL = Model.load(model_path('compass_gait_mit'))
-LAW = {'remedy': WALKING.remedy, 'pull': WALKING.pull, 'fastest': WALKING.fastest}
 
 
 @pytest.fixture(scope='module')
@@ -57,7 +55,7 @@ def ready():
 @pytest.fixture
 def walker(ready):
     def make(**changes):
-        settings = RecoverySettings(**LAW, **changes)
+        settings = RecoverySettings(**changes)
         gains = balance_gains(MODEL, settings, 0.002)
         basins = shipped_basins(MODEL, gains, MODEL.torque_limit)
         found = TreeController(BalanceController(MODEL, settings, gains, basins), settings)
@@ -84,7 +82,8 @@ def run(controller, duration, pushes=(), seed=2, robot=MODEL, rise=0.0):
     """From upright on the inner leg, with noise, quantisation and an observer."""
     setup = Setup(stance='inner', on_blocks=False)
     plant = Uneven(robot, setup, np.zeros(4), seed=seed)
-    plant.rise, plant.at = rise, 4
+    # On the outer leg: at 0.3 m/s the foot swings 95 mm above the ground there, 2 mm on the inner.
+    plant.rise, plant.at = rise, 5
     return balance(plant, HighGainObserver(MODEL, setup, 0.01), controller, duration, pushes)
 
 
@@ -97,10 +96,10 @@ def test_it_steps_in_walks_and_stands_again(walker):
     done = run(controller, 19.0)
     assert done.upright(19.0)
     at = landings(done)
-    # The way back to upright leads over two slower orbits, two to four steps each.
-    assert 6 <= len(at) <= 14
+    # It stops from the orbit that it is on: in the step that it is in, or the next one.
+    assert 6 <= len(at) <= 7
     # 0.3 m/s in steps of 0.3 m; one leg's step takes longer than the other's.
-    assert (at[6] - at[4]) / 2 == pytest.approx(1.0, abs=0.1)
+    assert (at[5] - at[3]) / 2 == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_push_does_not_stop_it(walker):
@@ -214,7 +213,8 @@ def test_nodes_are_told_how_to_walk():
     nodes = walk_nodes(WalkRunOptions(speed=0.3, steps=10, pushes=(5.0, 2.0), bag='here'))
     controller = nodes['tree_controller'].parameters
     assert (controller['speed'], controller['steps']) == (0.3, 10)
-    assert controller['remedy'] == 'phase'
+    # How it follows the tree is the tree's own law.
+    assert not {'remedy', 'pull', 'fastest'} & set(controller)
     machine = nodes['simulation_node'].parameters
     assert machine['initial_state'] == [0.0] * 4
     assert machine['pushes'] == [5.0, 2.0]

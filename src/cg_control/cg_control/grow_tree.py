@@ -30,9 +30,9 @@ from cg_control.extension import Extension, ExtensionOptions, upright_form
 from cg_control.growth import Counts, Grower, GrowthOptions, Region
 from cg_control.nodes import Nodes, Way
 from cg_control.preview import CHAMPIONS, LANDING, WALKERS, Preview, champions, pruned
+from cg_control.tracking import WALKING
 from cg_control.tree import Tree, TreeError
 from cg_control.tvlqr import Weights, balance_regulator
-from cg_control.walking import WALKING
 from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_description.paths import model_path
 from cg_dynamics.cluster import ClusterError

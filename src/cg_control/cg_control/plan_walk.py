@@ -8,12 +8,15 @@ What the tree controller needs to walk: docs/walking.md. Planning takes some sec
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from cg_control.collocation import PlanningError
 from cg_control.grow_tree import upright_tree
 from cg_control.nodes import Nodes
 from cg_control.orbit import Orbit, plan_orbit
+from cg_control.preview import pruned
 from cg_control.tree import Tree, TreeError
 from cg_control.walking import orbit_nodes, with_orbits, with_ways
 from cg_description.paths import model_path
@@ -69,14 +72,19 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument(
         '--base', type=Path, help='tree to upright, of grow_tree, that it becomes a part of'
     )
+    parser.add_argument(
+        '--champions', type=int, metavar='N',
+        help='of the tree to upright the first N champions of each leg stay [all of it]',
+    )  # fmt: skip
     parser.add_argument('--out', type=Path, required=True, help='file to write, .npz')
     options = parser.parse_args(args)
     try:
         if not options.out.absolute().parent.is_dir():
             raise TreeError(f'{options.out}: there is no such directory')
         model = Model.load(model_path(options.model))
-        base = Tree.load(options.base, model) if options.base else None
+        base = _base(options, model)
         tree = walking_tree(model, options.speeds, options.step, base)
+        tree = replace(tree, provenance=_provenance(options, model, base))
         tree.save(options.out)
     except (PlanningError, ValueError, OSError) as error:
         print(f'plan_walk: {error}', file=sys.stderr)
@@ -86,6 +94,28 @@ def main(args: list[str] | None = None) -> int:
         f'{tree.nodes.branches} branches'
     )
     return 0
+
+
+def _base(options: argparse.Namespace, model: Model) -> Tree | None:
+    """The tree to upright that is asked for."""
+    most = options.champions
+    if most is not None and (most < 1 or not options.base):
+        raise ValueError(f'--champions is {most}; it must be 1 or more, and needs --base')
+    if not options.base:
+        return None
+    base = Tree.load(options.base, model)
+    return base if most is None else pruned(base, most)
+
+
+def _provenance(options: argparse.Namespace, model: Model, base: Tree | None) -> dict[str, Any]:
+    """What the file says of how it was made."""
+    command = f'plan_walk --speeds {" ".join(map(str, options.speeds))} --step {options.step:g}'
+    if base is None:
+        return {'model': model.name, 'command': command}
+    command += ' --base TREE'
+    if options.champions is not None:
+        command += f' --champions {options.champions}'
+    return {'model': model.name, 'command': command, 'base': dict(base.provenance)}
 
 
 if __name__ == '__main__':

@@ -146,9 +146,14 @@ class Preview:
         return done.outcome == Outcome.ARRIVED
 
 
-def pruned(tree: Tree) -> Tree:
-    """A tree without the branches that begin at no champion and lead to no other home."""
-    named, leave = tree.champions, Routes.of(tree.nodes, tree.speeds.tolist()).departures
+def pruned(tree: Tree, most: int | None = None) -> Tree:
+    """A tree without the branches that begin at no champion and lead to no other home.
+
+    Args:
+        tree: With champions.
+        most: So many of the champions of each leg stay, the first ones; None: all.
+    """
+    named, leave = tree.champions[:, :most], Routes.of(tree.nodes, tree.speeds.tolist()).departures
     kept = np.append(named[named >= 0], [d.entry for d in leave]).astype(int)
     nodes, place = tree.nodes.pruned(np.unique(tree.nodes.branch[kept]))
     moved = np.where(named < 0, -1, place[named]).astype(np.int32)

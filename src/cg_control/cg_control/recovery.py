@@ -69,8 +69,8 @@ class RecoverySettings(BalanceSettings):
         minimum=0.1, maximum=3.1, live=True,
     )  # fmt: skip
     remedy: str = setting(
-        'event', 'what is done about impacts off their time', choices=('event', 'phase'),
-        live=True,
+        'tree', 'what is done about impacts off their time; tree: what the tree was made for',
+        choices=('tree', 'event', 'phase'), live=True,
     )  # fmt: skip
     pull: float = setting(
         5.0, 'phase: rate at which the phase is drawn to the surface that holds the state',
@@ -111,9 +111,10 @@ class RecoverySettings(BalanceSettings):
         live=True,
     )  # fmt: skip
 
-    @property
-    def tracking(self) -> TrackingSettings:
-        """Those of the law that follows."""
+    def law(self, tree: Tree) -> TrackingSettings:
+        """How a tree is followed."""
+        if self.remedy == 'tree':
+            return tree.law
         return TrackingSettings(remedy=self.remedy, pull=self.pull, fastest=self.fastest)
 
 
@@ -256,7 +257,7 @@ class TreeController:
             self._search_anew()
         self._ready = ready
         if ready is not None:
-            ready.tracker.settings = ready.preview.settings = self.settings.tracking
+            ready.tracker.settings = ready.preview.settings = self.settings.law(ready.tree)
             # Beyond these angles nothing is followed, so nothing is promised either.
             ready.preview.simulation = replace(
                 ready.preview.simulation, fall_angle=self.settings.fall_angle,

@@ -2,7 +2,8 @@
 
 A branch that begins on a home and leads to another one is a *departure*: a step in from upright,
 a change of speed, a stop. What begins where is seen from the states, so a tree needs no list of
-them. From upright to a fast orbit, or back, the way may lead over slower ones.
+them. Between distant speeds the way leads over those between, and to an orbit that no other way
+reaches over upright.
 """
 
 from collections.abc import Sequence
@@ -85,21 +86,32 @@ class Routes:
     def towards(self, home: int, wanted: int) -> dict[int, int]:
         """Node of a home -> branch to take there, on the ways of fewest changes to another home.
 
-        Empty where no way leads, or where the robot is there.
+        Empty where no way leads, or where the robot is there. On an orbit the robot comes by
+        every node; where it stands it stays on its leg, and takes the best way from there.
         """
         far = self._changes(wanted)
-        return {
-            d.node: d.entry
-            for d in self.departures
-            if d.home == home and far.get(d.onto, np.inf) < far.get(home, np.inf)
-        }
+        if home == wanted:
+            return {}
+        if home not in far and home != UPRIGHT and wanted != UPRIGHT:
+            return self.towards(home, UPRIGHT)
+        found: dict[int, Departure] = {}
+        for d in self.departures:
+            if d.home != home or d.onto not in far or d.onto == UPRIGHT != wanted:
+                continue
+            nearer = home == UPRIGHT or far[d.onto] < far[home]
+            if nearer and (d.node not in found or far[d.onto] < far[found[d.node].onto]):
+                found[d.node] = d
+        return {node: d.entry for node, d in found.items()}
 
     def _changes(self, wanted: int) -> dict[int, int]:
-        """How many branches it takes from each home to the wanted one."""
-        far, front = {wanted: 0}, [wanted]
+        """How many branches it takes from each home to the wanted one, never over upright.
+
+        To stop and step in again may be fewer changes than from speed to speed, but nobody asked
+        for a stop.
+        """
+        far, front = {wanted: 0}, {wanted}
         while front:
-            front = list({
-                d.home for d in self.departures if d.onto in front and d.home not in far
-            })
-            far |= {home: max(far.values()) + 1 for home in front}
+            through = front if wanted == UPRIGHT else front - {UPRIGHT}
+            front = {d.home for d in self.departures if d.onto in through} - far.keys()
+            far |= dict.fromkeys(front, max(far.values()) + 1)
         return far

@@ -66,6 +66,11 @@ class TrackingSettings(Settings):
         return self.pull if self.remedy == 'phase' else 0.0
 
 
+# Orbits are followed so: the phase is the projection on the surfaces, within what a robot can be
+# faster or slower.
+WALKING = TrackingSettings(remedy='phase', pull=500.0, fastest=10.0)
+
+
 class Tracker:
     """Nodes under feedback. The same object runs in the nodes, the benches and the tests.
 

@@ -42,7 +42,7 @@ from cg_control.tvlqr import (
 from cg_dynamics.model import Model
 
 # The balance controller's weights throw the swing leg away: its rate costs next to nothing there.
-WALKING = Weights(swing_rate=1.0, torque=1 / 100)
+TRANSVERSE = Weights(swing_rate=1.0, torque=1 / 100)
 # Tuned by the share of starts around two orbits that walk on; checked on others.
 OVER_PHASE = Weights(swing_angle=35.0, stance_rate=100.0, swing_rate=0.002, torque=1 / 2300)
 SWEEPS = 200  # round the orbit, after which its Riccati equation is said not to converge
@@ -110,7 +110,7 @@ def stabilise_transversely(
     Args:
         trajectory: With surfaces. A periodic one gets the cost to go that repeats itself.
         model: The one it was planned for.
-        weights: Of deviations in the surface; None takes WALKING.
+        weights: Of deviations in the surface; None takes TRANSVERSE.
         final_cost: Of deviations at the end of a motion that is not periodic, shape (4, 4), such
             as the cost to go of the orbit there; None: `weights.final` times that of
             `balance_regulator` on the last leg.
@@ -120,7 +120,7 @@ def stabilise_transversely(
         TrajectoryError: for another model's trajectory, or one without surfaces.
     """
     trajectory.require_model(model)
-    weights = weights or WALKING
+    weights = weights or TRANSVERSE
     design = design_of(trajectory, model)
     pieces = [_pieces(design, phase, weights) for phase in trajectory.phases]
     if not any(piece.frame is not None for of_phase in pieces for piece in of_phase):
@@ -169,15 +169,52 @@ def stabilise_over_phase(
     motion = stabilise_periodically(trajectory, model, weights or OVER_PHASE, restarts=True)
     phases = []
     for phase in motion.phases:
-        S, rates = phase.cost_to_go, phase.rates
-        normals = np.einsum('nij,nj->ni', S, rates)
-        # There S x0' = 0: whoever lands has ended the phase.
-        normals[-1] = IMPACT
-        normals /= np.einsum('ni,ni->n', normals, rates)[:, None]
-        across = np.eye(4) - rates[:, :, None] * normals[:, None, :]
+        normals, S = _own_normals(phase), phase.cost_to_go
+        across = np.eye(4) - phase.rates[:, :, None] * normals[:, None, :]
         cost = across.transpose(0, 2, 1) @ S @ across
         phases.append(replace(phase, normals=normals, cost_to_go=cost))
     return motion.with_phases(tuple(phases), surfaces='own', feedback='over phase')
+
+
+def with_own_surfaces(
+    trajectory: Trajectory, model: Model, weights: Weights | None = None
+) -> Trajectory:
+    """An orbit with the surfaces that the cost to go of TVLQR asks for, between impact surfaces.
+
+    As (OWN), but a phase begins with the impact surface, too: for `stabilise_transversely`, which
+    takes it that no phase is ever wrong.
+
+    Args:
+        trajectory: Periodic.
+        model: The one it was planned for.
+        weights: Of deviations; None takes OVER_PHASE.
+
+    Raises:
+        TrajectoryError: as `stabilise_periodically`.
+    """
+    motion = stabilise_periodically(trajectory, model, weights or OVER_PHASE, restarts=True)
+    phases = tuple(
+        replace(phase, normals=_own_normals(own, begins=True))
+        for phase, own in zip(trajectory.phases, motion.phases, strict=True)
+    )
+    return trajectory.with_phases(phases, surfaces='own')
+
+
+def _own_normals(phase: Phase, begins: bool = False) -> np.ndarray:
+    """Normals of (OWN) at the knots of a phase with a cost to go over time, (n, 4).
+
+    With `begins` its first surface is the impact surface.
+    """
+    normals = np.einsum('nij,nj->ni', phase.cost_to_go, phase.rates)
+    # There S x0' = 0: whoever lands has ended the phase.
+    normals[-1] = IMPACT
+    if begins:
+        normals[0] = IMPACT
+    crossing = np.einsum('ni,ni->n', normals, phase.rates)
+    if (crossing <= 0).any():
+        at = float(phase.time[np.argmax(crossing <= 0)])
+        raise TrajectoryError(f'at {at:.3g} s the motion does not cross its surface forward')
+    return normals / crossing[:, None]
 
 
 @dataclass(frozen=True)

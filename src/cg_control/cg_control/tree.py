@@ -13,6 +13,7 @@ import numpy as np
 
 from cg_control.archive import read_archive, write_archive
 from cg_control.nodes import ARRAYS, Nodes
+from cg_control.tracking import WALKING, TrackingSettings
 from cg_control.trajectory import TrajectoryError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
@@ -47,6 +48,15 @@ class Tree:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     champions: np.ndarray = field(default_factory=lambda: np.zeros((len(STANCES), 0), np.int32))
     speeds: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def law(self) -> TrackingSettings:
+        """How it is to be followed: as its funnels and tubes were found.
+
+        What leads to orbits is followed by the surfaces of the orbits, upwards by the clock that
+        is set at impacts.
+        """
+        return WALKING if len(self.speeds) else TrackingSettings()
 
     @property
     def legs(self) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ lock-step. On /diagnostics: mode, node, depth and branch, what look-ups, preview
 took, ages of the measurements and missed deadlines.
 
 in    /state, /applied_torque, /tree/selected
-out   /torque_command, /tree/node, /diagnostics
+out   /torque_command, /tree/node, /tree/reference, /diagnostics
 """
 
 import collections
@@ -47,6 +47,7 @@ from cg_dynamics.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 GAP = 0.02  # s between states after which the one before is history
+SHOWN = 0.05  # s between words about where the reference is, for people to look at
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ class TreeControllerNode(Node):
         self.message.header.frame_id = 'hip'
         self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
         self.node_publisher = self.create_publisher(Int32, '/tree/node', SENSOR_QOS)
+        self.reference_publisher = self.create_publisher(Int32, '/tree/reference', SENSOR_QOS)
+        self._referred_ns = 0
         self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
         self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
@@ -189,6 +192,9 @@ class TreeControllerNode(Node):
         if self.controller.entered != self._shown:
             self._shown = self.controller.entered
             self.node_publisher.publish(Int32(data=self._shown))
+        if not 0 <= stamp_ns - self._referred_ns < 1e9 * SHOWN:
+            self._referred_ns = stamp_ns
+            self.reference_publisher.publish(Int32(data=self.controller.node))
         spent = time.perf_counter() - began
         self._spent.append(spent)
         self._slow += spent > 1.0 / self.declared.values.sample_rate_hz

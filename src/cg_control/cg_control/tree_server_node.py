@@ -9,10 +9,13 @@ before stays selected.
 /tree/node       from the tree controller: the node that it went over to, -1 outside the tree
 /tree/branch     the way home from that node as JointTrajectory, latched; empty where there is none
 /tree/markers    the same as lines of hip and feet for RViz and Foxglove, latched; in the frame
-                 `world`, the foot that stands in its origin
+                 `world`, the foot that stands in its origin. On a way to an orbit the tube of
+                 the orbit, too: where hip and swing foot may be in it
+/tree/reference  from the tree controller, some times a second: the node that its reference is at
+/tree/surface    lines of the poses on the transversal surface there, in the same frame
 
-in    /tree/node
-out   /tree/selected, /tree/branch, /tree/markers
+in    /tree/node, /tree/reference
+out   /tree/selected, /tree/branch, /tree/markers, /tree/surface
 """
 
 from dataclasses import dataclass
@@ -28,6 +31,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from cg_control.tree import Tree
 from cg_control.tree_files import TreeSelection, tree_path
+from cg_control.tube_view import surface_segments, tube_segments
 from cg_control.way_home import WayHome
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -41,7 +45,9 @@ WIDTH = 0.01  # m, of a line
 # (red, green, blue) of each line; the legs as in the URDF.
 COLOURS = {
     'hip': (0.2, 0.2, 0.2), 'inner_foot': (0.85, 0.45, 0.1), 'outer_foot': (0.1, 0.4, 0.75),
+    'tube_hip': (0.2, 0.2, 0.2), 'tube_foot': (0.1, 0.6, 0.3), 'surface': (0.7, 0.1, 0.5),
 }  # fmt: skip
+THIN, CLEAR = 0.003, 0.5  # width in m and opacity of the lines of a tube and of a surface
 
 
 @dataclass(frozen=True)
@@ -65,11 +71,14 @@ class TreeServerNode(Node):
         self.model = Model.load(self.declared.values.model_file or model_path(NOMINAL_MODEL))
         self.tree: Tree | None = None
         self.problem = 'nothing selected yet'
+        self._way: WayHome | None = None
         self._followed: TreeServerSettings | None = None
         self.selected = self.create_publisher(String, '/tree/selected', LATCHED_QOS)
         self.branch = self.create_publisher(JointTrajectory, '/tree/branch', LATCHED_QOS)
         self.markers = self.create_publisher(MarkerArray, '/tree/markers', LATCHED_QOS)
+        self.surface = self.create_publisher(MarkerArray, '/tree/surface', 10)
         self.create_subscription(Int32, '/tree/node', self.on_node, SENSOR_QOS)
+        self.create_subscription(Int32, '/tree/reference', self.on_reference, SENSOR_QOS)
         self.create_service(Trigger, '~/load', self.on_load)
         self.poll()
 
@@ -106,13 +115,26 @@ class TreeServerNode(Node):
         """The controller went over to another node."""
         self.show(message.data)
 
+    def on_reference(self, message: Int32) -> None:
+        """The reference has moved on."""
+        segments = np.zeros((0, 2, 2))
+        if self.tree is not None and self._way is not None:
+            segments = surface_segments(
+                self.tree.nodes, self._way, message.data, self.model.values['leg_length']
+            )
+        self.surface.publish(segment_markers({'surface': segments}))
+
     def show(self, node: int) -> None:
         """Publish the way home from a node; an empty one where there is none."""
-        way = None
+        self._way, length = None, self.model.values['leg_length']
+        # Of the way before; namespaces that are not shown again would stay.
+        tube = segment_markers({})
         if self.tree is not None and 0 <= node < len(self.tree.nodes):
-            way = WayHome.along(self.tree.nodes, node)
-        self.branch.publish(joint_trajectory(way))
-        self.markers.publish(marker_array(way, self.model.values['leg_length']))
+            self._way = WayHome.along(self.tree.nodes, node)
+            tube = segment_markers(tube_segments(self.tree.nodes, self._way, length))
+        self.branch.publish(joint_trajectory(self._way))
+        lines = marker_array(self._way, length)
+        self.markers.publish(MarkerArray(markers=[*tube.markers, *lines.markers]))
 
 
 def joint_trajectory(way: WayHome | None) -> JointTrajectory:
@@ -136,29 +158,40 @@ def joint_trajectory(way: WayHome | None) -> JointTrajectory:
 
 
 def marker_array(way: WayHome | None, leg_length: float) -> MarkerArray:
-    """Lines of hip and feet; where there is no way, what takes away those of before.
+    """Lines of hip and feet; none where there is no way.
 
     Args:
         way: The way home.
         leg_length: In m.
     """
     if way is None or len(way.nodes) < 2:
-        gone = Marker(action=Marker.DELETEALL)
-        gone.header.frame_id = FRAME
-        return MarkerArray(markers=[gone])
+        return MarkerArray()
     lines = way.points(leg_length)
     return MarkerArray(markers=[
         _line(number, name, points) for number, (name, points) in enumerate(lines.items())
     ])  # fmt: skip
 
 
-def _line(number: int, name: str, points: np.ndarray) -> Marker:
-    line = Marker(ns=name, id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
+def segment_markers(segments: dict[str, np.ndarray]) -> MarkerArray:
+    """What takes away everything of before, then segments (n, 2, 2) by name, if there are any."""
+    gone = Marker(action=Marker.DELETEALL)
+    gone.header.frame_id = FRAME
+    return MarkerArray(markers=[gone] + [
+        _line(number, name, ends.reshape(-1, 2), Marker.LINE_LIST, THIN, CLEAR)
+        for number, (name, ends) in enumerate(segments.items()) if len(ends)
+    ])  # fmt: skip
+
+
+def _line(
+    number: int, name: str, points: np.ndarray, kind: int = Marker.LINE_STRIP,
+    width: float = WIDTH, opacity: float = 1.0,
+) -> Marker:  # fmt: skip
+    line = Marker(ns=name, id=number, type=kind, action=Marker.ADD)
     line.header.frame_id = FRAME
     line.pose.orientation.w = 1.0
-    line.scale.x = WIDTH
+    line.scale.x = width
     red, green, blue = COLOURS[name]
-    line.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+    line.color = ColorRGBA(r=red, g=green, b=blue, a=opacity)
     line.points = [Point(x=float(x), z=float(z)) for x, z in points]
     return line
 

@@ -1,10 +1,11 @@
 """The tree of a robot that walks: orbits, and the motions that lead to them and away.
 
 Its homes are upright, on each leg, and the orbits, one for each speed. Between them lead motions
-that are planned as any branch of a tree: steps in from upright, changes of speed between
-neighbours, stops. A motion ends anywhere on the phase of an orbit that it joins, or upright; its
-gains and its cost to go are continued from there. On such a tree more motions can be grown: a push
-is answered by a way back to an orbit, or to upright, in as many steps as it takes (growth.py).
+that are planned as any branch of a tree: steps in from upright and stops, of every orbit, and
+changes of speed between neighbours. A motion ends anywhere on the phase of an orbit that it joins,
+or upright; its gains and its cost to go are continued from there. On such a tree more motions can
+be grown: a push is answered by a way back to an orbit, or to upright, in as many steps as it takes
+(growth.py).
 """
 
 import contextlib
@@ -21,8 +22,9 @@ from cg_control.nodes import Nodes
 from cg_control.orbit import Orbit
 from cg_control.preview import LANDING
 from cg_control.rollouts import follow
+from cg_control.routes import UPRIGHT as STANDING
 from cg_control.task import UPRIGHT, Box, Goal, Stretch, Task
-from cg_control.tracking import TrackingSettings
+from cg_control.tracking import WALKING
 from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import stabilise_over_phase
 from cg_control.tree import Tree
@@ -36,9 +38,6 @@ log = logging.getLogger(__name__)
 # s by which a state in a tube may be off the surface of its phase: more than half of what lies
 # between two knots, so that tubes hold all of the orbit, and less than what leaves the orbit.
 LAG = 0.05
-
-# The phase is the projection on the surfaces, within what a robot can be faster or slower.
-WALKING = TrackingSettings(remedy='phase', pull=500.0, fastest=10.0)
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,9 @@ def with_orbits(tree: Tree, orbits: Sequence[Nodes], speeds: Sequence[float]) ->
 def with_ways(
     tree: Tree, model: Model, options: ExtensionOptions | None = None, most: int = 2
 ) -> Tree:
-    """A tree with motions from home to home: steps in, changes to the next speed, stops.
+    """A tree with motions from home to home: steps in, stops, changes to the next speed.
+
+    What is not found is left out, and logged: then the way leads over a neighbour.
 
     Args:
         tree: With orbits, slowest first.
@@ -188,13 +189,10 @@ def with_ways(
     wanted: list[tuple[int, int]] = []  # (node to leave from, home to go to)
     roots = np.flatnonzero(nodes.planned < 0)
     for orbit in range(count):
-        leaves = nodes.phase_starts(orbit)
-        if orbit == 0:
-            wanted += [(int(root), orbit) for root in roots]
-            wanted += [(int(node), -1) for node in leaves]
-        for onto in (orbit - 1, orbit + 1):
-            if 0 <= onto < count:
-                wanted += [(int(node), onto) for node in leaves]
+        wanted += [(int(root), orbit) for root in roots]
+        neighbours = [onto for onto in (orbit - 1, orbit + 1) if 0 <= onto < count]
+        for onto in (STANDING, *neighbours):
+            wanted += [(int(node), onto) for node in nodes.phase_starts(orbit)]
     ways = 0
     for node, onto in wanted:
         branch = planned(nodes, node, onto, model, options, most)
@@ -240,7 +238,7 @@ def _ends(
     for impacts in range(most + 1):
         modes = tuple(STANCES[(leg + k) % 2] for k in range(impacts + 1))
         last = STANCES.index(modes[-1])
-        if onto < 0:
+        if onto == STANDING:
             roots = np.flatnonzero((nodes.planned < 0) & (nodes.stance == last))
             if len(roots):
                 yield modes, roots[:1], UPRIGHT

@@ -58,14 +58,22 @@ class WayHome:
         Returns:
             'hip', 'inner_foot' and 'outer_foot' -> (x ahead, z up) in m, shape (n, 2).
         """
-        q = self.states[:, :2]
-        up = leg_length * np.stack([np.sin(q), np.cos(q)], axis=-1)  # foot to hip: (n, leg, 2)
-        rows = np.arange(len(q))
+        up = self._legs(leg_length)
+        stands = np.column_stack([self.feet(leg_length, foot), np.zeros(len(up))])
+        hip = stands + up[np.arange(len(up)), self.stance]
+        return {'hip': hip, 'inner_foot': hip - up[:, 0], 'outer_foot': hip - up[:, 1]}
+
+    def feet(self, leg_length: float, foot: float = 0.0) -> np.ndarray:
+        """Where the foot that stands is, m ahead, shape (n,); arguments as `points`."""
+        up, rows = self._legs(leg_length), np.arange(len(self.states))
         # A step carries the stance foot to where the swing foot has landed.
         stride = (up[rows, 1 - self.stance] - up[rows, self.stance])[:, 0]
         steps = np.flatnonzero(np.diff(self.stance)) + 1
-        moved = np.zeros(len(q))
+        moved = np.zeros(len(rows))
         moved[steps] = stride[steps]
-        stands = np.column_stack([foot + np.cumsum(moved), np.zeros(len(q))])
-        hip = stands + up[rows, self.stance]
-        return {'hip': hip, 'inner_foot': hip - up[:, 0], 'outer_foot': hip - up[:, 1]}
+        return foot + np.cumsum(moved)
+
+    def _legs(self, leg_length: float) -> np.ndarray:
+        """From each foot to the hip, shape (n, leg, 2)."""
+        q = self.states[:, :2]
+        return leg_length * np.stack([np.sin(q), np.cos(q)], axis=-1)

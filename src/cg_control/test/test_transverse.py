@@ -18,10 +18,11 @@ from cg_control.preview import LANDING
 from cg_control.rollouts import follow
 from cg_control.surfaces import UNITS, between, design_of, phase_of, with_surfaces
 from cg_control.task import Box, Task
+from cg_control.tracking import WALKING
 from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import (
     OVER_PHASE,
-    WALKING,
+    TRANSVERSE,
     UnstableError,
     frame,
     monodromy,
@@ -29,16 +30,17 @@ from cg_control.transverse import (
     stabilise_over_phase,
     stabilise_transversely,
     transverse_linearisation,
+    with_own_surfaces,
 )
 from cg_control.tvlqr import (
     GAUSS,
+    Weights,
     exponentials,
     jump_matrix,
     magnus,
     stabilise,
     stabilise_periodically,
 )
-from cg_control.walking import WALKING as ON_SURFACES
 from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.impact import impact
 
@@ -225,7 +227,7 @@ def test_gains_do_not_see_deviations_along_the_motion(orbit):
 
 def test_cost_to_go_repeats_itself_and_is_what_a_period_costs(fine, walker):
     """z'Pz at the start is what a period costs plus z'Pz at its end, in the linear closed loop."""
-    design, Q, R = design_of(fine, walker), WALKING, WALKING.R[0, 0]
+    design, Q, R = design_of(fine, walker), TRANSVERSE, TRANSVERSE.R[0, 0]
     start = fine.phases[0]
     E = frame(start.normals[0])
     before = E.T @ start.cost_to_go[0] @ E
@@ -329,7 +331,7 @@ def test_where_there_are_no_surfaces_it_is_tvlqr(orbit, walker):
         },
     )
     plain = stabilise(
-        replace(one, phases=(early,)), walker, WALKING, final_cost=found.cost_to_go[9]
+        replace(one, phases=(early,)), walker, TRANSVERSE, final_cost=found.cost_to_go[9]
     )
     # There friction that is not dry takes part, here nothing that is compensated.
     np.testing.assert_allclose(found.cost_to_go[:10], plain.phases[0].cost_to_go,
@@ -370,9 +372,39 @@ def test_gains_over_phase_hold_the_robot_on_surfaces_of_their_own_cost(gait, wal
     x = done.states[0] + 0.3 * UNITS * [1, -1, 1, 1]
     nodes = Nodes.orbit(done, walker)
     ends = follow(
-        nodes, walker, np.zeros(1, int), x[None], 20 * done.duration / 2, settings=ON_SURFACES,
+        nodes, walker, np.zeros(1, int), x[None], 20 * done.duration / 2, settings=WALKING,
         options=replace(LANDING, slope=SLOPE),
     )  # fmt: skip
     cost = nodes.cost_to_go(int(ends.node[0]), float(ends.elapsed[0]), ends.state[0])
     assert ends.impacts[0] >= 15
     assert cost < 1e-3 * nodes.cost_to_go(0, 0.0, x)
+
+
+def test_transverse_gains_on_its_own_surfaces_walk_up_a_slope_that_is_not_known(robot):
+    """Half a degree up, from a fifth of the box of bench/walking_rivals.py: widest planes fall."""
+    orbit, count = plan_orbit(robot, 0.25, 0.3), 24
+    d = 0.2 * np.random.default_rng(1).uniform(-1, 1, (count, 3)) * [0.08, 0.5, 1.0]
+    x = orbit.trajectory.states[0] + np.column_stack([-d[:, 0], d[:, 0], d[:, 1], d[:, 2]])
+    uphill = replace(LANDING, slope=-np.radians(0.5))
+    # Landed on that ground, the legs as far apart.
+    x[:, :2] += uphill.slope - x[:, :2].sum(axis=1)[:, None] / 2
+    walk_on = {}
+    for name, motion in (
+        ('own', with_own_surfaces(orbit.trajectory, robot)),
+        ('widest', with_surfaces(orbit.trajectory, robot)),
+    ):
+        done = stabilise_transversely(motion, robot, Weights())
+        assert np.abs(np.linalg.eigvals(monodromy(done, robot))).max() < 0.5
+        for phase in done.phases:
+            assert np.abs((phase.normals * phase.rates).sum(axis=1) - 1).max() < 1e-9
+            for k in (0, -1):
+                np.testing.assert_allclose(phase.normals[k][:2].std(), 0.0, atol=1e-9)
+                np.testing.assert_allclose(phase.normals[k][2:], 0.0, atol=1e-9)
+        nodes = Nodes.orbit(done, robot)
+        ends = follow(
+            nodes, robot, np.zeros(count, int), x, 20 * orbit.period, settings=WALKING,
+            options=uphill,
+        )  # fmt: skip
+        walk_on[name] = int((ends.impacts >= 20).sum())
+    assert walk_on['own'] >= 0.9 * count
+    assert walk_on['widest'] < count / 2

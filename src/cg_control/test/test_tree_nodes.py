@@ -21,6 +21,7 @@ from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
 from cg_control.lookup import Lookup  # noqa: E402
+from cg_control.tracking import WALKING, TrackingSettings  # noqa: E402
 from cg_control.tree import Tree  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
 from cg_control.tree_files import TreeSelection, tree_path  # noqa: E402
@@ -190,9 +191,11 @@ def test_the_server_selects_shows_and_refuses(bench, tree, stranger, tmp_path, s
     node = bench.peer.create_publisher(Int32, '/tree/node', SENSOR_QOS)
     bench.until(lambda: node.get_subscription_count() >= 2)
     node.publish(Int32(data=start))
-    bench.until(lambda: bench.branches[-1].points and len(bench.markers[-1].markers) == 3)
+    bench.until(lambda: bench.branches[-1].points and len(bench.markers[-1].markers) == 4)
     way = WayHome.along(tree.nodes, start)
-    branch, lines = bench.branches[-1], bench.markers[-1].markers
+    # What was shown before goes first.
+    branch, (gone, *lines) = bench.branches[-1], bench.markers[-1].markers
+    assert gone.action == Marker.DELETEALL
     assert branch.header.frame_id == 'inner_foot'
     np.testing.assert_array_equal([p.positions for p in branch.points], way.states[:, :2])
     np.testing.assert_array_equal([p.effort[0] for p in branch.points], way.torque)
@@ -286,6 +289,61 @@ def test_another_tree_is_followed_from_the_next_state_on(bench, tree, start, tmp
     bench.select(node, tree_path('compass_gait_mit'))
     bench.tell(BEGIN + 2 * PERIOD, tree.nodes.x0[start])
     assert node.controller.node == start
+
+
+def test_tube_and_surface_of_what_is_followed_are_shown(bench):
+    server = bench.add(TreeServerNode(parameter_overrides=overrides(tree='compass_gait_mit_walk')))
+    surfaces = []
+    bench.peer.create_subscription(MarkerArray, '/tree/surface', surfaces.append, 10)
+    node = bench.controller(speed=0.25)
+    bench.until(lambda: node.controller.tree is not None)
+    bench.until(lambda: node.reference_publisher.get_subscription_count())
+    bench.until(lambda: server.surface.get_subscription_count())
+    nodes = node.controller.tree.nodes
+    on = int(nodes.phase_starts(1)[0])
+    told = []
+    bench.peer.create_subscription(Int32, '/tree/reference', told.append, SENSOR_QOS)
+    bench.until(lambda: node.reference_publisher.get_subscription_count() >= 2)
+    for tick in range(51):  # 0.1 s
+        bench.tell(BEGIN + tick * PERIOD, nodes.x0[on])
+    bench.until(lambda: len(told) >= 3 and len(surfaces) >= 3)
+    # Every 50 ms, not every sample.
+    assert len(told) == len(surfaces) == 3
+    assert nodes.orbit_of[[m.data for m in told]].tolist() == [1, 1, 1]
+    names = [m.ns for m in bench.markers[-1].markers]
+    assert names == ['', 'tube_hip', 'tube_foot', 'hip', 'inner_foot', 'outer_foot']
+    tube = bench.markers[-1].markers[2]
+    assert tube.type == Marker.LINE_LIST
+    assert 0 < len(tube.points) <= 2 * 960
+    assert [m.ns for m in surfaces[-1].markers] == ['', 'surface']
+    assert len(surfaces[-1].markers[1].points) == 40
+    # Outside the tree there is neither.
+    for tick in range(51, 110):
+        bench.tell(BEGIN + tick * PERIOD, np.array([0.5, -0.5, 1.5, 4.0]))
+    bench.until(lambda: len(surfaces[-1].markers) == 1 and len(bench.markers[-1].markers) == 1)
+    assert surfaces[-1].markers[0].action == Marker.DELETEALL
+
+
+def test_a_tree_that_is_selected_is_followed_by_its_own_law(bench, tree, start):
+    """One that walks by the surfaces of its orbits, one to upright by the clock."""
+    node = bench.controller(speed=0.25)
+    bench.select(node, tree_path('compass_gait_mit_walk'))
+    walk = node.controller.tree
+    on = int(walk.nodes.phase_starts(1)[0])
+    bench.tell(BEGIN, walk.nodes.x0[on])
+    ready = node.controller._ready
+    assert ready.tracker.settings == ready.preview.settings == WALKING
+    bench.select(node, tree_path('compass_gait_mit'))
+    bench.tell(BEGIN + PERIOD, tree.nodes.x0[start])
+    ready = node.controller._ready
+    assert ready.tracker.settings == ready.preview.settings == TrackingSettings()
+    assert ready.tracker.settings.pulled == 0.0
+    # What is set by hand counts.
+    (result,) = node.set_parameters(overrides(remedy='event'))
+    assert result.successful
+    bench.select(node, tree_path('compass_gait_mit_walk'))
+    bench.tell(BEGIN + 2 * PERIOD, walk.nodes.x0[on])
+    assert node.controller._ready.tracker.settings.remedy == 'event'
 
 
 def test_parameters_act_live_or_are_refused(bench, tree, start):

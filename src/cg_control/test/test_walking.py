@@ -12,12 +12,11 @@ from cg_control.orbit import plan_orbit
 from cg_control.preview import LANDING
 from cg_control.rollouts import Outcome, follow
 from cg_control.routes import UPRIGHT, Departure, Routes
-from cg_control.tracking import Tracker
+from cg_control.tracking import WALKING, Tracker
 from cg_control.trajectory import TrajectoryError
 from cg_control.tree import Tree, TreeError
 from cg_control.tree_files import tree_path
 from cg_control.walking import (
-    WALKING,
     TubeOptions,
     across,
     buried,
@@ -151,7 +150,9 @@ def test_arriving_is_being_in_the_tube_on_the_orbit(robot, shipped, compiled, mo
     assert (done.time[: len(inside)] == 0.0).all()
     assert (done.time[len(inside) :] > 0.0).all()
     # The step in begins in the goal region of the leg that stands, and does not end there.
-    assert (nodes.orbit_of[done.node[-len(entry) :]] == 0).all()
+    np.testing.assert_array_equal(
+        nodes.orbit_of[done.node[-len(entry) :]], nodes.orbit_of[entry]
+    )
     assert (done.impacts[-len(entry) :] >= 1).all()
 
 
@@ -198,16 +199,66 @@ def test_the_way_home_onto_an_orbit_goes_round_once(shipped):
     assert (np.diff(hip[:, 0]) > -1e-9).all()  # it never goes back
 
 
-def test_routes_go_over_other_homes(shipped):
+def test_no_way_is_planned_twice(shipped):
+    ways = Routes.of(shipped.nodes, shipped.speeds).departures
+    assert len({(d.node, d.onto) for d in ways}) == len(ways)
+    # A step in and a stop of each orbit from either leg, and to each neighbour.
+    count = len(shipped.speeds)
+    assert len(ways) == 4 * count + 4 * (count - 1)
+
+
+def test_from_every_speed_the_robot_stops_and_to_every_speed_it_steps_in_at_once(robot, shipped):
+    nodes = shipped.nodes
+    routes = Routes.of(nodes, shipped.speeds)
+    entries = []
+    for orbit in range(len(shipped.speeds)):
+        stops = routes.towards(orbit, UPRIGHT)
+        assert sorted(stops) == nodes.phase_starts(orbit).tolist()
+        starts = routes.towards(UPRIGHT, orbit)
+        assert sorted(starts) == sorted(nodes.root_of)
+        assert (nodes.orbit_of[list(stops.values())] == UPRIGHT).all()
+        assert (nodes.orbit_of[list(starts.values())] == orbit).all()
+        entries += [*stops.values(), *starts.values()]
+    assert (nodes.steps[entries] <= 2).all()
+    entry = np.array(entries)
+    done = follow(
+        nodes, robot, entry, nodes.x0[entry], nodes.to_go[entry] + 3.0, goal=shipped.goal,
+        settings=WALKING, options=LANDING,
+    )  # fmt: skip
+    assert (done.outcome == Outcome.ARRIVED).all()
+    np.testing.assert_array_equal(nodes.orbit_of[done.node], nodes.orbit_of[entry])
+
+
+def test_from_speed_to_speed_the_robot_does_not_stop(shipped):
     routes = Routes.of(shipped.nodes, shipped.speeds)
     last = len(shipped.speeds) - 1
-    home, hops = UPRIGHT, []
+    home, hops = 0, []
     while home != last:
         ways = routes.towards(home, last)
         assert ways
         home = int(shipped.nodes.orbit_of[next(iter(ways.values()))])
         hops.append(home)
-    assert hops == sorted(hops)
+    assert hops == list(range(1, last + 1))
+
+
+def test_ways_that_are_missing_are_gone_round():
+    """From upright on the leg that has a way, over upright where there is no other one."""
+    routes = Routes(
+        (
+            Departure(UPRIGHT, 0, 20, 1), Departure(UPRIGHT, 0, 30, 0),
+            Departure(UPRIGHT, 1, 40, 0), Departure(0, 5, 50, 1), Departure(1, 6, 60, UPRIGHT),
+        ),
+        (0.2, 0.3),
+    )  # fmt: skip
+    assert routes.towards(UPRIGHT, 1) == {0: 20, 1: 40}
+    assert routes.towards(0, UPRIGHT) == {5: 50}
+    assert routes.towards(1, 0) == {6: 60}
+    assert routes.towards(UPRIGHT, 0) == {0: 30, 1: 40}
+
+
+def test_the_home_of_a_speed_is_the_nearest(shipped):
+    routes = Routes.of(shipped.nodes, shipped.speeds)
+    last = len(shipped.speeds) - 1
     assert routes.towards(last, last) == {}
     assert routes.home_at(0.0) == UPRIGHT
     assert routes.home_at(9.0) == last

@@ -11,9 +11,10 @@ from cg_control.growth import Branch
 from cg_control.nodes import Way
 from cg_control.preview import Preview, pruned
 from cg_control.routes import Routes
+from cg_control.tracking import WALKING
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.walking import WALKING, buried
+from cg_control.walking import buried
 from cg_control.walking_region import OrbitPoints, WalkingRegion
 from cg_dynamics.c_compiler import compiler
 
