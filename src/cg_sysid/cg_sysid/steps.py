@@ -57,6 +57,7 @@ def find_step(
     quantum: float,
     spans: tuple[int, ...] = SPANS,
     knocks: bool = False,
+    timing: float = 0.0,
 ) -> Step | None:
     """The clearest step of a signal; None if there is none.
 
@@ -68,6 +69,7 @@ def find_step(
         spans: Samples on each side of an instant, in increasing order.
         knocks: The body may be knocked, as a foot that lands does: then branches of different
             rate that meet close by are no step.
+        timing: Error of the instants of sampling in s, root mean square, where one is known.
     """
     spacing = np.diff(time)
     usual = float(np.median(spacing))
@@ -82,6 +84,7 @@ def find_step(
         distance = _distance(sampled, span)
         least = CERTAIN * sigma * _spread(span) + ROUNDING * quantum + 1e-9 * np.ptp(values)
         least = least + CERTAIN * JITTER * moved
+        least = least + CERTAIN * (timing / usual) * moved * _spread(span)
         limit = np.maximum(least, USUAL * _usual(np.abs(distance), span))
         for k in holes:
             a, b = np.searchsorted(grid, [time[k], time[k + 1]])
