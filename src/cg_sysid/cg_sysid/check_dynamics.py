@@ -36,6 +36,8 @@ MOVED = 6.0  # standard errors of a term that makes a fault, [1]
 ANSWERED = 5.0  # standard errors of an answer to what a record does not show, [1]
 LIKE = 0.35  # such a term agrees with the fault to within this share, [1]
 SHORT = 2.5  # samples by which a topic ends before the others
+RESTING_S = 0.1  # s before and after an instant in which a joint that rests does not move
+RESTING = 6.0  # noise floors that a joint at rest moves over: two counts, or as much of noise
 BEYOND = 'beyond_torque'  # name of what a limit may hide
 CLIPPED = 0.3  # share of the torque beyond a limit that the joint answered, [1]
 
@@ -63,7 +65,7 @@ def check_dynamics(
         broken = list(_broken(raw, wanted, motion, torque, angle, law)) if sound else []
         yield from broken
         if not broken:
-            yield from _unanswered(wanted[torque], motion, angle)
+            yield from _unanswered(wanted[torque], wanted[angle], motion)
             yield from _clipped(wanted, motion, torque, angle)
 
 
@@ -200,8 +202,9 @@ def _spread_out(
     return _left(motion, torque, angle, since)
 
 
-def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]:
-    """A step of the torque that the joint does not answer."""
+def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Finding]:
+    """A step of the torque that the joint does not answer; friction may hold one that rests."""
+    angle = joint.channel
     step = find_step(torque.time, torque.values, torque.noise.sigma, torque.noise.quantum)
     if step is None:
         return
@@ -214,11 +217,19 @@ def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]
     expected = law.factor * step.size
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
-        yield Finding('zero_shift', 'error', torque.channel, f'jumps by {step.size:.3g} '
-                      f'{torque.unit}, which {angle} does not answer',
+        held = _rests(joint, step.time)
+        yield Finding('zero_shift', 'warning' if held else 'error', torque.channel,
+                      f'jumps by {step.size:.3g} {torque.unit}, which {angle} does not answer'
+                      + (', but it rests there, and friction may hold it' if held else ''),
                       float(torque.time[step.sample - 1]), step.time,
                       int(torque.sample[step.sample]), step.size,
                       MOVED * error / abs(law.factor))
+
+
+def _rests(joint: Signal, instant: float) -> bool:
+    """Whether a joint does not move around an instant."""
+    near = joint.values[np.abs(joint.time - instant) < RESTING_S]
+    return len(near) > 1 and float(np.ptp(near)) <= RESTING * joint.noise.sigma_floor
 
 
 def _clipped(

@@ -22,6 +22,7 @@ CLIPPED_RUN = 3  # samples at the extreme value in a row that may be a flat top
 LONG_TOP = 6  # samples of a single flat top that counts by itself: a turn on a count is shorter
 VISITS = 2  # flat tops at one value, else: no two turns end in the same place by chance
 REPEATS = 8  # samples at the extreme value: noise that is not rounded repeats none
+COARSER = 4.0  # at most as much coarser are numbers two octaves up, [1]
 PAIRS = 5  # equal neighbours elsewhere that show that a signal is rounded after all
 TOP_SIDE = 12  # samples beside a flat top that show how fast it was reached
 ALIKE = 0.2  # ratio of the slopes on the two sides of a flat top, at least, [1]
@@ -204,7 +205,7 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
         runs = [(a, b) for a, b in runs if at[a]]
         if not runs:
             continue
-        grain = noise.quantum or _grain(values)
+        grain = noise.quantum or _grain(values, limit)
         noisy = grain == 0.0 and noise.sigma > 1e-6 * np.ptp(values)
         long = [run for run in runs if run[1] - run[0] + 1 >= FROZEN_SAMPLES]
         abrupt = any(_comes_and_goes(signal, *run) == (True, True) for run in long)
@@ -223,7 +224,7 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
     return findings, limits
 
 
-def _grain(values: np.ndarray) -> float:
+def _grain(values: np.ndarray, level: float) -> float:
     """Step by which a signal goes on where neighbours are equal; 0 if hardly any are.
 
     A signal may be rounded though no one quantum fits it: rounded before a calibration that is
@@ -232,7 +233,12 @@ def _grain(values: np.ndarray) -> float:
     inner = (values > values.min()) & (values < values.max())
     steps = np.abs(np.diff(values))
     pairs = np.flatnonzero((steps[:-1] == 0.0) & (steps[1:] > 0.0) & inner[:-2] & inner[2:])
-    return float(np.median(steps[pairs + 1])) if len(pairs) >= PAIRS else 0.0
+    if len(pairs) < PAIRS:
+        return 0.0
+    grain = float(np.median(steps[pairs + 1]))
+    # It may be coarser at that level, as floating point is coarser at large numbers.
+    next_to = float(np.min(np.abs(values - level), where=values != level, initial=np.inf))
+    return max(grain, min(next_to, COARSER * grain))
 
 
 def _height_over(signal: Signal, first: int, last: int, grain: float) -> float:
