@@ -205,7 +205,7 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
         runs = [(a, b) for a, b in runs if at[a]]
         if not runs:
             continue
-        grain = noise.quantum or _grain(values, limit)
+        grain = max(noise.quantum, _grain(values, limit))
         noisy = grain == 0.0 and noise.sigma > 1e-6 * np.ptp(values)
         long = [run for run in runs if run[1] - run[0] + 1 >= FROZEN_SAMPLES]
         abrupt = any(_comes_and_goes(signal, *run) == (True, True) for run in long)
