@@ -2,10 +2,10 @@
 
     python3 -m cg_sysid.check BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
 
-The checks themselves are in clock.py, check_timing.py and check_jitter.py (stamps), check_signals.py and
-check_steps.py (single signals), check_kinematics.py (IMU against itself), check_dynamics.py
-(motion against torque), check_signs.py (signs of all channels together) and check_content.py
-(note, coverage, feedback).
+The checks themselves are in clock.py, check_timing.py and check_jitter.py (stamps),
+check_signals.py and check_steps.py (single signals), check_kinematics.py (IMU against itself),
+check_dynamics.py (motion against torque), check_signs.py (signs of all channels together) and
+check_content.py (note, coverage, feedback).
 """
 
 import argparse

@@ -18,16 +18,13 @@ from cg_sysid.findings import Finding
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
 from cg_sysid.resting import resting_band
-from cg_sysid.steps import Step, find_step, step_at
+from cg_sysid.steps import Step, find_step, step_at, zero_known_to
 
 SURE = 4.0  # standard deviations within which two numbers count as equal, [1]
 SHORT = 1.5  # sampling times by which a topic that lost samples ends early, at least, [1]
 AT_ONCE = 3.0  # sampling times between steps of one event, [1]
 MOVING = 6.0  # standard deviations of its rate from which a channel counts as moving, [1]
 MIRRORED = 0.01  # of the size of a step by which a mirror image may be off, [1]
-# A fit tells the zero of a recording to 0.3 to 0.6 mrad (docs/results.md): less cannot be seen.
-FINE = {'rad': 1e-3, 'm': 1e-4}
-FINE_SHARE = 1e-3  # of the motion: the torques that follow from an angle are off by no more, [1]
 SHARE = 0.15  # of a missing time that may be wrong because the rate changes over it, [1]
 
 
@@ -82,7 +79,7 @@ def _shift(
 ) -> Finding:
     """A zero that moved: an error where it moved further than zeros are known to."""
     text = f'jumps by {step.size:.4g} {signal.unit} from one sample to the next and stays there'
-    fine = max(FINE[signal.unit], FINE_SHARE * float(np.ptp(signal.values)))
+    fine = zero_known_to(signal.values, signal.unit)
     slips = all(abs(v) < MOVING * step.rate_sigma for v in (step.rate_before, step.rate_after))
     if abs(step.size) < fine:
         text += f', by less than the {fine:.2g} {signal.unit} to which a zero is known'

@@ -81,6 +81,7 @@ def diagnosis_facts(
         },
         'unmodelled': _unmodelled(diagnosis),
         'wandering': _wandering(diagnosis),
+        'late_samples': diagnosis.late,
         'landings': _landings(diagnosis),
         'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
         **_fitted(diagnosis.nominal, fit),
@@ -108,6 +109,7 @@ def unusable_facts(
         'remaining_error': {},
         'unmodelled': None,
         'wandering': None,
+        'late_samples': '',
         'landings': None,
         'ranking': [],
         'parameters': [
@@ -177,6 +179,7 @@ def identification_facts(
         },
         'unmodelled': None,
         'wandering': None,
+        'late_samples': '',
         'landings': None,
         'ranking': [],
         **_fitted(model, fit),

@@ -11,7 +11,7 @@ of c^2 among samples of like rate, as knocks and steps are few. Resonances and r
 the rate are not white: they shrink from contrast to wider contrast, and the least answer counts.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +25,9 @@ MEDIAN = 0.4549  # median of the square of a standard normal number
 REACH = 3  # samples on either side that the rate is the slope over
 CERTAIN = 3.5  # standard errors from which the slope is one: the errors are of ten parts
 FELT = 1.0  # variance that the timing adds at speed over that of the sensor: less hurts no fit
-# Quanta^2. At three counts in two samples the error of rounding alternates between +-1/4: the widest
-# contrast makes 0.32 of it, and a median of equal squares seems 2.2 times as much: 0.7 in all, and
-# that is what FELT asks for above this.
+# Quanta^2. At three counts in two samples the error of rounding alternates between +-1/4: the
+# widest contrast makes 0.32 of it, and a median of equal squares seems 2.2 times as much: 0.7 in
+# all, and that is what FELT asks for above this.
 ROUNDING = 0.35
 LEAST = 0.03  # of the spacing: to this share steps.py takes any instant to be known, [1]
 ALIKE = 2.0  # ratio of the answers of two channels of one sensor that are one answer, [1]
@@ -88,16 +88,6 @@ def timing_error(
     sigma = float(np.sqrt(slope))
     error = float(weight.sum() ** -0.5) / (2.0 * sigma)
     return TimingError(sigma, error, tuple(shown))
-
-
-def worst_timing_error(
-    records: Sequence[Mapping[str, tuple[np.ndarray, np.ndarray]]],
-) -> TimingError | None:
-    """That of the records which is largest; None unless most of them show one."""
-    found = [error for error in map(timing_error, records) if error is not None]
-    if 2 * len(found) <= len(records):
-        return None
-    return max(found, key=lambda error: error.sigma, default=None)
 
 
 def _contradicts(line: _Line, slope: float) -> bool:
