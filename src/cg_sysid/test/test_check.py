@@ -244,8 +244,24 @@ def test_a_refusal_can_be_overruled_and_stays_in_the_report():
     assert report.overruled[0].text.endswith('used anyway')
     # Another fault is none that was overruled, and what reading refuses cannot be.
     assert check_recording(hip(frozen(1000, 1250))(raw), use_anyway=[code]).verdict == 'unusable'
-    with pytest.raises(ValueError, match='not_finite.*sensor_clipping'):
+    with pytest.raises(ValueError, match=r'not_finite.*sensor_clipping'):
         check_recording(raw, use_anyway=['not_finite'])
+
+
+def test_the_command_line_overrules_and_lists_what_can_be(tmp_path, capsys):
+    values = synthesise(Synthesis(duration=2.0), 0)
+    record = bags.to_record(with_values(
+        values, '/hip_encoder', 'hip_angle', lambda v: v + 0.05 * (np.arange(len(v)) > 500)))
+    path = str(bags.write_bag(tmp_path / 'shifted', record))
+    assert check.main([path]) == 1
+    capsys.readouterr()
+    assert check.main([path, '--use-anyway', 'stuck', '--use-anyway', 'zero_shift', '--json']) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert [f['code'] for f in report['findings'] if f['overruled']] == ['zero_shift']
+    assert check.main([path, '--use-anyway', 'shift']) == 2
+    error = capsys.readouterr().err
+    assert "'shift'" in error
+    assert all(name in error for name in OVERRULABLE)
 
 
 def test_every_code_is_documented():

@@ -12,10 +12,12 @@ from cg_dynamics.model import Model
 from cg_sysid import spoil
 from cg_sysid.bags import read_bag, to_record, write_bag
 from cg_sysid.check import check_recording
+from cg_sysid.diagnosis_file import unusable_facts
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
 from cg_sysid.intake import take_in
 from cg_sysid.rehearse import rehearse
+from cg_sysid.report.page import render
 
 MODEL = model_path('compass_gait_mit')
 SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',
@@ -240,3 +242,24 @@ def test_a_fault_in_a_bag_is_told_where_the_bag_is_taken_in(tmp_path):
     used = next(source for source in intake.sources if source.name == 'jumped')
     assert {f.code for f in used.check.findings if f.repair} == {'clock_jump'}
     np.testing.assert_array_equal(read_bag(paths[1]).stamp_ns, record.stamp_ns)
+
+
+def test_a_bag_that_is_used_anyway_is_told_in_answer_and_report(tmp_path):
+    record = record_of(machine_of(), 'spring_stabilised_outer', 3)
+    shifted = replace(record, outputs={
+        **record.outputs, 'imu_angle': record.outputs['imu_angle'] + 0.005 * (record.time > AT),
+    })
+    path = write_bag(tmp_path / 'shifted', shifted)
+    intake = take_in([path], MODEL, use_anyway=['zero_shift'])
+    assert not intake.left_out
+    assert len(intake.records) == 1
+    facts = unusable_facts(Model.load(MODEL), intake, 'Too few.', {'options': {}})
+    (entry,) = facts['overruled']
+    assert (entry['name'], entry['code'], entry['where']) == ('shifted', 'zero_shift', 'imu_angle')
+    said = 'shifted used in spite of what the check finds: zero_shift.'
+    assert facts['summary'] == f'Too few. {said}'
+    page = render(facts, [])
+    assert 'Used anyway' in page
+    assert 'imu_angle 3.2' in page
+    with pytest.raises(ValueError, match='shift'):
+        take_in([path], MODEL, use_anyway=['shift'])

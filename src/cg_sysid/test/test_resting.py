@@ -19,7 +19,7 @@ def test_a_pendulum_rests_within_friction_over_weight():
 
 def test_twice_the_friction_is_twice_the_band():
     none, once, twice = (
-        resting_band(PENDULUM.with_effect('coulomb_friction', torque=torque), Setup())['angle']
+        resting_band(PENDULUM.with_values({'coulomb_friction.torque': torque}), Setup())['angle']
         for torque in (0.0, 0.005, 0.01)
     )
     assert twice - none == pytest.approx(2 * (once - none), rel=1e-6)
