@@ -57,7 +57,7 @@ def swing(seed, sigma, rounding):
 
 
 def told_table(seeds) -> Iterator[str]:
-    yield '| free swings, rounded as | jitter, ms RMS | cases | refused, by | told | told, ms RMS |'
+    yield '| free swings, rounded as | jitter, ms RMS | cases | refused, by | told | told, ms |'
     yield '|---|---:|---:|---|---:|---:|'
     for rounding in ROUNDING:
         for sigma in JITTER:

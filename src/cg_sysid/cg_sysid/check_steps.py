@@ -71,11 +71,11 @@ def check_steps(
                           'show no gap', *place, missing or None, 0.0)
         else:
             bands = _resting_bands(raw, model) if bands is None else bands
-            yield _shift(step, signal, place, bands.get(name, 0.0))
+            yield _shift(step, signal, place, bands.get(name, 0.0), _play(raw, model))
 
 
 def _shift(
-    step: Step, signal: Signal, place: tuple[float, float, int], band: float
+    step: Step, signal: Signal, place: tuple[float, float, int], band: float, play: float
 ) -> Finding:
     """A zero that moved: an error where it moved further than zeros are known to."""
     text = f'jumps by {step.size:.4g} {signal.unit} from one sample to the next and stays there'
@@ -83,12 +83,22 @@ def _shift(
     slips = all(abs(v) < MOVING * step.rate_sigma for v in (step.rate_before, step.rate_after))
     if abs(step.size) < fine:
         text += f', by less than the {fine:.2g} {signal.unit} to which a zero is known'
+    elif abs(step.size) < play:
+        fine = play
+        text += f', within the play of {play:.2g} {signal.unit}'
     elif slips and abs(step.size) < band:
         fine = band
         text += f', at rest, where friction allows {band:.2g} {signal.unit}'
     else:
         return Finding('zero_shift', 'error', signal.channel, text, *place, step.size, step.limit)
     return Finding('zero_shift', 'warning', signal.channel, text, *place, step.size, fine)
+
+
+def _play(raw: RawRecording, model: Model | None) -> float:
+    """The widest play of the model's gears; what is light crosses it between two samples."""
+    if model is None or model.mechanism.name != raw.mechanism:
+        return 0.0
+    return max((model.values_of(effect).get('gap', 0.0) for effect in model.effects), default=0.0)
 
 
 def _resting_bands(raw: RawRecording, model: Model | None) -> dict[str, float]:
