@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.channels import mechanism
-from cg_sysid.check_signals import Signal, limit_runs
+from cg_sysid.check_signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.findings import Finding
 from cg_sysid.law import Law, Motion, fit_law, joint_of, motion_of
 from cg_sysid.raw import RawRecording
@@ -36,8 +36,6 @@ MOVED = 6.0  # standard errors of a term that makes a fault, [1]
 ANSWERED = 5.0  # standard errors of an answer to what a record does not show, [1]
 LIKE = 0.35  # such a term agrees with the fault to within this share, [1]
 SHORT = 2.5  # samples by which a topic ends before the others
-RESTING_S = 0.1  # s before and after an instant in which a joint that rests does not move
-RESTING = 6.0  # noise floors that a joint at rest moves over: two counts, or as much of noise
 BEYOND = 'beyond_torque'  # name of what a limit may hide
 CLIPPED = 0.3  # share of the torque beyond a limit that the joint answered, [1]
 
@@ -217,19 +215,13 @@ def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Findi
     expected = law.factor * step.size
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
-        held = _rests(joint, step.time)
+        held = rests(joint, step.time - RESTING_S, step.time + RESTING_S)
         yield Finding('zero_shift', 'warning' if held else 'error', torque.channel,
                       f'jumps by {step.size:.3g} {torque.unit}, which {angle} does not answer'
                       + (', but it rests there, and friction may hold it' if held else ''),
                       float(torque.time[step.sample - 1]), step.time,
                       int(torque.sample[step.sample]), step.size,
                       MOVED * error / abs(law.factor))
-
-
-def _rests(joint: Signal, instant: float) -> bool:
-    """Whether a joint does not move around an instant."""
-    near = joint.values[np.abs(joint.time - instant) < RESTING_S]
-    return len(near) > 1 and float(np.ptp(near)) <= RESTING * joint.noise.sigma_floor
 
 
 def _clipped(

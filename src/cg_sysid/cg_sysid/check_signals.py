@@ -22,6 +22,8 @@ CLIPPED_RUN = 3  # samples at the extreme value in a row that may be a flat top
 LONG_TOP = 6  # samples of a single flat top that counts by itself: a turn on a count is shorter
 VISITS = 2  # flat tops at one value, else: no two turns end in the same place by chance
 REPEATS = 8  # samples at the extreme value: noise that is not rounded repeats none
+RESTING_S = 0.1  # s before and after an instant in which a joint that rests does not move
+RESTING = 8.0  # noise floors that a joint at rest moves over: two counts, or as much of noise
 COARSER = 4.0  # at most as much coarser are numbers two octaves up, [1]
 PAIRS = 5  # equal neighbours elsewhere that show that a signal is rounded after all
 TOP_SIDE = 12  # samples beside a flat top that show how fast it was reached
@@ -99,6 +101,12 @@ def _quantum_of_pieces(values: np.ndarray) -> float:
     """Resolution of most pieces of a signal: a zero that moved leaves counts in two rows."""
     pieces = np.array_split(values, max(1, len(values) // PIECE))
     return float(np.median([resolution(piece) for piece in pieces]))
+
+
+def rests(signal: Signal, start: float, stop: float) -> bool:
+    """Whether a joint does not move between two instants in s; a turn is no rest."""
+    within = signal.values[(signal.time > start) & (signal.time < stop)]
+    return len(within) > 1 and float(np.ptp(within)) <= RESTING * signal.noise.sigma_floor
 
 
 def check_signals(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:

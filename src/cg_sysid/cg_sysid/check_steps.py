@@ -13,7 +13,7 @@ from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_sysid.channels import mechanism
 from cg_sysid.check_jitter import timing_errors
-from cg_sysid.check_signals import Signal, without_spikes
+from cg_sysid.check_signals import RESTING_S, Signal, rests, without_spikes
 from cg_sysid.findings import Finding
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
@@ -80,7 +80,8 @@ def _shift(
     """A zero that moved: an error where it moved further than zeros are known to."""
     text = f'jumps by {step.size:.4g} {signal.unit} from one sample to the next and stays there'
     fine = zero_known_to(signal.values, signal.unit)
-    slips = all(abs(v) < MOVING * step.rate_sigma for v in (step.rate_before, step.rate_after))
+    before, at = place[0], step.time
+    slips = rests(signal, before - RESTING_S, before) and rests(signal, at, at + RESTING_S)
     if abs(step.size) < fine:
         text += f', by less than the {fine:.2g} {signal.unit} to which a zero is known'
     elif abs(step.size) < play:

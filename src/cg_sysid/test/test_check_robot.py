@@ -270,6 +270,18 @@ def test_a_joint_at_rest_may_slip_as_far_as_friction_allows():
         assert report.verdict == verdict
 
 
+def test_a_joint_that_turns_is_none_that_rests():
+    # Friction would let the hip rest 97 mrad off, but where it turns it does not rest.
+    record = record_of(machine_of(), 'swing_outer_fixed', 1)
+    angle = record.outputs['hip_angle']
+    turn = 500 + int(np.argmax(angle[500:-500]))
+    shifted = replace(record, outputs={
+        **record.outputs, 'hip_angle': angle + 0.03 * (np.arange(len(angle)) >= turn)})
+    report = check_recording(spoil.as_recorded(shifted, 1), MODEL)
+    assert report.of('zero_shift')
+    assert report.verdict == 'unusable'
+
+
 def test_a_bag_that_is_used_anyway_is_told_in_answer_and_report(tmp_path):
     record = record_of(machine_of(), 'spring_stabilised_outer', 3)
     shifted = replace(record, outputs={
