@@ -74,7 +74,7 @@ def tables(data: Path, plots: Path | None) -> Iterator[str]:
         alone = [check_recording(raw) for raw in raws]
         told: Counter[str] = Counter()
         for raw, report in zip(raws, reports, strict=True):
-            told.update({f.code for f in report.findings if f.severity == 'warning'})
+            told.update(sorted({f.code for f in report.findings if f.severity == 'warning'}))
             refusals += [(name, report.name, f) for f in report.findings
                          if f.severity == 'error']
             if plots is not None and report.verdict == 'unusable':
