@@ -2,16 +2,16 @@
 
     python3 -m cg_sysid.check BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
 
-The checks themselves are in clock.py and check_timing.py (stamps), check_signals.py and
-check_steps.py (single signals), check_kinematics.py (IMU against itself), check_dynamics.py
-(motion against torque), check_signs.py (signs of all channels together) and check_content.py
-(note, coverage, feedback).
+The checks themselves are in clock.py, check_timing.py and check_jitter.py (stamps),
+check_signals.py and check_steps.py (single signals), check_kinematics.py (IMU against itself),
+check_dynamics.py (motion against torque), check_signs.py (signs of all channels together) and
+check_content.py (note, coverage, feedback).
 """
 
 import argparse
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from cg_dynamics.model import Model
 from cg_sysid.bags import RawRecording, load_note, read_raw, to_record
 from cg_sysid.check_content import check_content
 from cg_sysid.check_dynamics import check_dynamics
+from cg_sysid.check_jitter import check_jitter
 from cg_sysid.check_kinematics import check_kinematics
 from cg_sysid.check_signals import check_signals, read_signals
 from cg_sysid.check_signs import check_signs
@@ -29,7 +30,7 @@ from cg_sysid.check_steps import check_steps
 from cg_sysid.check_timing import check_timing
 from cg_sysid.clock import mend_clocks
 from cg_sysid.errors import RecordingError
-from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.findings import CheckReport, Finding, make_report, overrulable, overrule
 from cg_sysid.progress import Bars
 from cg_sysid.touchdown import find_touchdowns
 
@@ -41,6 +42,7 @@ def check_recording(
     model: str | Path | None = None,
     use_region: Mapping[str, tuple[float, float]] | None = None,
     note: Mapping[str, Any] | None = None,
+    use_anyway: Iterable[str] = (),
 ) -> CheckReport:
     """Check a recording.
 
@@ -50,10 +52,16 @@ def check_recording(
         use_region: Quantity -> (lowest, highest) value at which the model will be used, for
             channels and rates of angles, such as `{'hip_angle_rate': (-2.0, 2.0)}`.
         note: Recording note for a bag that carries none.
+        use_anyway: Names of findings that make no recording unusable; `findings.OVERRULABLE` has
+            those that may be named.
 
     Returns:
         The findings. A bag that cannot be read at all gives the one finding `unreadable`.
+
+    Raises:
+        ValueError: `use_anyway` names what cannot be overruled.
     """
+    anyway = overrulable(use_anyway)
     try:
         raw = recording if isinstance(recording, RawRecording) else read_raw(recording, note)
         setup_error = _setup_error(raw)
@@ -64,16 +72,17 @@ def check_recording(
         return make_report(raw.name, [setup_error])
     raw, clocks = mend_clocks(raw)
     signals = read_signals(raw)
-    findings = [*clocks, *check_timing(raw), *check_signals(raw, signals)]
+    timing = [*clocks, *check_timing(raw), *check_jitter(signals)]
+    findings = [*overrule([*timing, *check_signals(raw, signals)], anyway)]
     # What depends on several samples makes no sense where single ones, or their stamps, are wrong.
     faulty = {finding.where for finding in findings if finding.severity == 'error'}
     sane = {n: s for n, s in signals.items() if not faulty & {n, s.topic}}
     robot, unreadable = _model(model)
-    jumps = [*check_steps(raw, sane), *check_kinematics(sane)]
-    findings += _not_of_landings(raw, robot, jumps)
+    jumps = [*check_steps(raw, sane, robot), *check_kinematics(sane)]
+    findings += overrule(_not_of_landings(raw, robot, jumps), anyway)
     sound = not any(finding.severity == 'error' for finding in findings)
-    findings += check_dynamics(raw, signals, sound)
-    findings += [*check_signs(raw, sane, robot), *unreadable]
+    findings += overrule(check_dynamics(raw, signals, sound), anyway)
+    findings += [*overrule(check_signs(raw, sane, robot), anyway), *unreadable]
     findings += check_content(raw, signals, model, use_region)
     if not any(finding.severity == 'error' for finding in findings):
         findings += _refused(raw)
@@ -149,6 +158,15 @@ def parse_region(text: str) -> tuple[str, tuple[float, float]]:
     return name, (float(low), float(high))
 
 
+def use_anyway_option(parser: argparse.ArgumentParser) -> None:
+    """The option that overrules the check."""
+    parser.add_argument(
+        '--use-anyway', action='append', default=[], metavar='FINDING',
+        help='use recordings in spite of this finding of the check, such as zero_shift; the '
+        'answer says so; may be repeated',
+    )  # fmt: skip
+
+
 def main(argv: list[str] | None = None) -> int:
     """Command line: check recordings. Exit code 0 if all are usable, 1 otherwise."""
     parser = argparse.ArgumentParser(prog='cg check', description='Check recordings before use.')
@@ -158,11 +176,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--note', help='YAML file with the recording note, for bags without one')
     parser.add_argument('--use-region', action='append', default=[], metavar='NAME=LOW:HIGH',
                         help='where the model will be used; may be repeated')
+    use_anyway_option(parser)
     args = parser.parse_args(argv)
     try:
         region = dict(parse_region(text) for text in args.use_region)
         note = load_note(args.note) if args.note else None
         model = model_path(args.model) if args.model else None
+        anyway = overrulable(args.use_anyway)
     except (OSError, ValueError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
@@ -170,7 +190,7 @@ def main(argv: list[str] | None = None) -> int:
     with Bars('cg check') as bars:
         for done, bag in enumerate(args.bags):
             bars('checking recordings', done, len(args.bags))
-            reports.append(check_recording(bag, model, region, note))
+            reports.append(check_recording(bag, model, region, note, anyway))
     if args.json:
         print(json.dumps([report.to_dict() for report in reports], indent=1, default=float))
     else:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.channels import mechanism
-from cg_sysid.check_signals import Signal, limit_runs
+from cg_sysid.check_signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.findings import Finding
 from cg_sysid.law import Law, Motion, fit_law, joint_of, motion_of
 from cg_sysid.raw import RawRecording
@@ -63,7 +63,7 @@ def check_dynamics(
         broken = list(_broken(raw, wanted, motion, torque, angle, law)) if sound else []
         yield from broken
         if not broken:
-            yield from _unanswered(wanted[torque], motion, angle)
+            yield from _unanswered(wanted[torque], wanted[angle], motion)
             yield from _clipped(wanted, motion, torque, angle)
 
 
@@ -200,8 +200,9 @@ def _spread_out(
     return _left(motion, torque, angle, since)
 
 
-def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]:
-    """A step of the torque that the joint does not answer."""
+def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Finding]:
+    """A step of the torque that the joint does not answer; friction may hold one that rests."""
+    angle = joint.channel
     step = find_step(torque.time, torque.values, torque.noise.sigma, torque.noise.quantum)
     if step is None:
         return
@@ -214,8 +215,10 @@ def _unanswered(torque: Signal, motion: Motion, angle: str) -> Iterator[Finding]
     expected = law.factor * step.size
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
-        yield Finding('zero_shift', 'error', torque.channel, f'jumps by {step.size:.3g} '
-                      f'{torque.unit}, which {angle} does not answer',
+        held = rests(joint, step.time - RESTING_S, step.time + RESTING_S)
+        yield Finding('zero_shift', 'warning' if held else 'error', torque.channel,
+                      f'jumps by {step.size:.3g} {torque.unit}, which {angle} does not answer'
+                      + (', but it rests there, and friction may hold it' if held else ''),
                       float(torque.time[step.sample - 1]), step.time,
                       int(torque.sample[step.sample]), step.size,
                       MOVED * error / abs(law.factor))

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cg_sysid.check_jitter import timing_errors
 from cg_sysid.check_signals import Signal
 from cg_sysid.findings import Finding
-from cg_sysid.steps import find_step
+from cg_sysid.steps import find_step, zero_known_to
 
 WINDOW_S = 0.1  # angles are compared with integrated rates over spans of this length, in s
 BIAS_WINDOW_S = 0.25  # and over spans of this length where the zero of the rate is in question
@@ -24,6 +25,7 @@ SIDE = 5  # fewest spans before and after a change of scale
 BIAS_SIDE = 2  # and before and after one of the rate's zero
 FREEDOM = 6  # fewest spans beyond those that the fit of a shift uses up
 SHIFTED = 8.0  # standard errors of a shift of the rate's zero, [1]
+FASTEST = 0.95  # quantile of the rates that errors of timing are taken at
 REST_SPANS = (12, 25, 50, 100)  # the angle less the integrated rate is smooth over longer spans
 
 
@@ -188,9 +190,16 @@ def _shift_of_angle(imu: Imu, integral: np.ndarray) -> Iterator[Finding]:
     noise = imu.angle.noise
     if find_step(imu.angle.time, imu.angle.values, noise.sigma, noise.quantum):
         return  # large enough to be found without the rate
-    step = find_step(imu.time, imu.values - integral, noise.sigma, noise.quantum, REST_SPANS)
+    # Where instants of sampling are off, the angle is, by that times the rate.
+    late = timing_errors({s.channel: s for s in (imu.angle, imu.rate)})
+    sigma = noise.sigma
+    if late:
+        sigma = float(np.hypot(sigma, late[imu.angle.topic].sigma * np.quantile(
+            np.abs(imu.speed), FASTEST)))
+    step = find_step(imu.time, imu.values - integral, sigma, noise.quantum, REST_SPANS)
     if step:
-        yield Finding('zero_shift', 'error', imu.angle.channel,
+        grave = abs(step.size) >= zero_known_to(imu.values, imu.angle.unit)
+        yield Finding('zero_shift', 'error' if grave else 'warning', imu.angle.channel,
                       f'jumps by {step.size:.4g} rad while imu_rate shows no such motion',
                       float(imu.time[step.sample - 1]), step.time, int(imu.sample[step.sample]),
                       step.size, step.limit)

@@ -19,6 +19,13 @@ from cg_sysid.record import NS_PER_S
 PIECE = 200  # samples
 FROZEN_SAMPLES = 15  # shortest run of one value that is looked at
 CLIPPED_RUN = 3  # samples at the extreme value in a row that may be a flat top
+LONG_TOP = 6  # samples of a single flat top that counts by itself: a turn on a count is shorter
+VISITS = 2  # flat tops at one value, else: no two turns end in the same place by chance
+REPEATS = 8  # samples at the extreme value: noise that is not rounded repeats none
+RESTING_S = 0.1  # s before and after an instant in which a joint that rests does not move
+RESTING = 8.0  # noise floors that a joint at rest moves over: two counts, or as much of noise
+COARSER = 4.0  # at most as much coarser are numbers two octaves up, [1]
+PAIRS = 5  # equal neighbours elsewhere that show that a signal is rounded after all
 TOP_SIDE = 12  # samples beside a flat top that show how fast it was reached
 ALIKE = 0.2  # ratio of the slopes on the two sides of a flat top, at least, [1]
 TOP_QUANTA = 2.5  # a top this many quanta flat is normal, [1]
@@ -58,6 +65,11 @@ class Signal:
     noise: ChannelNoise
     unit: str
 
+    @property
+    def rate(self) -> float:
+        """Usual sampling rate in Hz."""
+        return 1.0 / float(np.median(np.diff(self.time)))
+
 
 def read_signals(raw: RawRecording) -> dict[str, Signal]:
     """Every channel of a recording that has enough samples to be checked."""
@@ -89,6 +101,12 @@ def _quantum_of_pieces(values: np.ndarray) -> float:
     """Resolution of most pieces of a signal: a zero that moved leaves counts in two rows."""
     pieces = np.array_split(values, max(1, len(values) // PIECE))
     return float(np.median([resolution(piece) for piece in pieces]))
+
+
+def rests(signal: Signal, start: float, stop: float) -> bool:
+    """Whether a joint does not move between two instants in s; a turn is no rest."""
+    within = signal.values[(signal.time > start) & (signal.time < stop)]
+    return len(within) > 1 and float(np.ptp(within)) <= RESTING * signal.noise.sigma_floor
 
 
 def check_signals(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
@@ -184,7 +202,8 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
 
     Motion that reaches its highest count stays there for a while, too, and friction may hold it.
     Then it comes in slowly: a cubic that goes on with the slopes on both sides stays within a
-    count or two. Noise without resolution never repeats its extreme value at all.
+    count or two. So a level is the end of a sensor where motion says so, at several visits or at
+    a long one. Noise that is not rounded never repeats its extreme value at all.
     """
     values, noise = signal.values, signal.noise
     findings, limits = [], []
@@ -194,13 +213,15 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
         runs = [(a, b) for a, b in runs if at[a]]
         if not runs:
             continue
-        analogue = noise.quantum == 0.0 and noise.sigma > 1e-6 * np.ptp(values)
-        heights = [_height_over(signal, a, b) for a, b in runs]
-        a, b = max(runs, key=lambda run: run[1] - run[0])
+        grain = max(noise.quantum, _grain(values, limit))
+        noisy = grain == 0.0 and noise.sigma > 1e-6 * np.ptp(values)
         long = [run for run in runs if run[1] - run[0] + 1 >= FROZEN_SAMPLES]
         abrupt = any(_comes_and_goes(signal, *run) == (True, True) for run in long)
-        if not analogue and not abrupt and not any(height > 1.0 for height in heights):
+        beyond = [(a, b) for a, b in runs if _height_over(signal, a, b, grain) > 1.0]
+        ends = len(beyond) >= VISITS or any(b - a + 1 >= LONG_TOP for a, b in beyond)
+        if not abrupt and not ends and not (noisy and at.sum() >= REPEATS):
             continue
+        a, b = max(runs, key=lambda run: run[1] - run[0])
         length = sum(signal.time[last] - signal.time[first] for first, last in runs)
         limits.append(limit)
         findings.append(Finding(
@@ -211,7 +232,24 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
     return findings, limits
 
 
-def _height_over(signal: Signal, first: int, last: int) -> float:
+def _grain(values: np.ndarray, level: float) -> float:
+    """Step by which a signal goes on where neighbours are equal; 0 if hardly any are.
+
+    A signal may be rounded though no one quantum fits it: rounded before a calibration that is
+    no straight line, or in single precision. Its ends say nothing here, as it may be clipped.
+    """
+    inner = (values > values.min()) & (values < values.max())
+    steps = np.abs(np.diff(values))
+    pairs = np.flatnonzero((steps[:-1] == 0.0) & (steps[1:] > 0.0) & inner[:-2] & inner[2:])
+    if len(pairs) < PAIRS:
+        return 0.0
+    grain = float(np.median(steps[pairs + 1]))
+    # It may be coarser at that level, as floating point is coarser at large numbers.
+    next_to = float(np.min(np.abs(values - level), where=values != level, initial=np.inf))
+    return max(grain, min(next_to, COARSER * grain))
+
+
+def _height_over(signal: Signal, first: int, last: int, grain: float) -> float:
     """How far a motion would go beyond a flat top, over what rounding and noise may feign."""
     values, time, noise = signal.values, signal.time, signal.noise
     n = TOP_SIDE
@@ -227,7 +265,7 @@ def _height_over(signal: Signal, first: int, last: int) -> float:
     # A cubic with these slopes at its ends is this high in its middle.
     height = width * (rise + fall) / 8.0
     feigned = width * noise.sigma_floor * float(np.linalg.norm(solve)) * np.sqrt(2.0) / 8.0
-    normal = TOP_QUANTA * noise.quantum + TOP_SIGMA * feigned + 1e-9 * float(np.ptp(values))
+    normal = TOP_QUANTA * grain + TOP_SIGMA * feigned + 1e-9 * float(np.ptp(values))
     # Beside a step one slope is not that of a motion.
     return height / normal if min(rise, fall) > ALIKE * max(rise, fall) > 0.0 else 0.0
 

@@ -10,12 +10,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from cg_dynamics.mechanisms.compass_gait import CompassGait
+from cg_dynamics.model import Model
 from cg_sysid.channels import mechanism
-from cg_sysid.check_signals import Signal, without_spikes
+from cg_sysid.check_jitter import timing_errors
+from cg_sysid.check_signals import RESTING_S, Signal, rests, without_spikes
 from cg_sysid.findings import Finding
 from cg_sysid.raw import RawRecording
 from cg_sysid.record import NS_PER_S
-from cg_sysid.steps import Step, find_step, step_at
+from cg_sysid.resting import resting_band
+from cg_sysid.steps import Step, find_step, step_at, zero_known_to
 
 SURE = 4.0  # standard deviations within which two numbers count as equal, [1]
 SHORT = 1.5  # sampling times by which a topic that lost samples ends early, at least, [1]
@@ -25,13 +28,18 @@ MIRRORED = 0.01  # of the size of a step by which a mirror image may be off, [1]
 SHARE = 0.15  # of a missing time that may be wrong because the rate changes over it, [1]
 
 
-def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
+def check_steps(
+    raw: RawRecording, signals: dict[str, Signal], model: Model | None = None
+) -> Iterator[Finding]:
     """Findings about steps of the measured angles.
 
     Args:
         raw: The recording, its clocks mended.
         signals: Its channels, without those that froze or that ran into a limit.
+        model: Nominal model of the machine; it knows where friction lets a joint rest.
     """
+    timing = timing_errors(signals)
+    bands: dict[str, float] | None = None
     known = mechanism(raw.mechanism)
     clean = {
         name: without_spikes(signals[name])
@@ -42,9 +50,11 @@ def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
     for name, signal in clean.items():
         if not name.endswith('angle'):
             continue  # a torque may jump, and a rate at a knock
+        late = timing[signal.topic].sigma if signal.topic in timing else 0.0
         step = find_step(
-            signal.time, signal.values, signal.noise.sigma, signal.noise.quantum, knocks=knocks
-        )
+            signal.time, signal.values, signal.noise.sigma, signal.noise.quantum, knocks=knocks,
+            timing=late,
+        )  # fmt: skip
         if step is None:
             continue
         place = (float(signal.time[step.sample - 1]), step.time, int(signal.sample[step.sample]))
@@ -60,9 +70,46 @@ def check_steps(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
                           f'{step.size:.4g} {signal.unit}: {time} missing in the stamps, which '
                           'show no gap', *place, missing or None, 0.0)
         else:
-            yield Finding('zero_shift', 'error', name, f'jumps by {step.size:.4g} {signal.unit} '
-                          'from one sample to the next and stays there', *place, step.size,
-                          step.limit)
+            bands = _resting_bands(raw, model) if bands is None else bands
+            yield _shift(step, signal, place, bands.get(name, 0.0), _play(raw, model))
+
+
+def _shift(
+    step: Step, signal: Signal, place: tuple[float, float, int], band: float, play: float
+) -> Finding:
+    """A zero that moved: an error where it moved further than zeros are known to."""
+    text = f'jumps by {step.size:.4g} {signal.unit} from one sample to the next and stays there'
+    fine = zero_known_to(signal.values, signal.unit)
+    before, at = place[0], step.time
+    slips = rests(signal, before - RESTING_S, before) and rests(signal, at, at + RESTING_S)
+    if abs(step.size) < fine:
+        text += f', by less than the {fine:.2g} {signal.unit} to which a zero is known'
+    elif abs(step.size) < play:
+        fine = play
+        text += f', within the play of {play:.2g} {signal.unit}'
+    elif slips and abs(step.size) < band:
+        fine = band
+        text += f', at rest, where friction allows {band:.2g} {signal.unit}'
+    else:
+        return Finding('zero_shift', 'error', signal.channel, text, *place, step.size, step.limit)
+    return Finding('zero_shift', 'warning', signal.channel, text, *place, step.size, fine)
+
+
+def _play(raw: RawRecording, model: Model | None) -> float:
+    """The widest play of the model's gears; what is light crosses it between two samples."""
+    if model is None or model.mechanism.name != raw.mechanism:
+        return 0.0
+    return max((model.values_of(effect).get('gap', 0.0) for effect in model.effects), default=0.0)
+
+
+def _resting_bands(raw: RawRecording, model: Model | None) -> dict[str, float]:
+    """Friction over stiffness of each joint, by the model; empty without one."""
+    if model is None or model.mechanism.name != raw.mechanism:
+        return {}
+    try:
+        return resting_band(model, raw.setup)
+    except ValueError:
+        return {}  # a set-up that this model cannot have: reading says so
 
 
 def _mirrored(step: Step) -> bool:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cg_sysid import bags, parallel
+from cg_sysid.check import use_anyway_option
 from cg_sysid.report.wording import event_words, left_words, undetermined_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
@@ -67,6 +68,7 @@ def common_options(parser: argparse.ArgumentParser) -> None:
         '--input', choices=('applied', 'command'), dest='torque',
         help='torque that the model is driven with [applied, or the command where there is none]',
     )  # fmt: skip
+    use_anyway_option(parser)
     parser.add_argument('--date', help='ISO 8601 date to put into the results [now]')
     parser.add_argument('--quiet', action='store_true', help='no progress, no tables')
 

@@ -44,6 +44,7 @@ from cg_sysid.diagnosis import (
     Candidate,
     Cause,
     Diagnosis,
+    Gain,
     Options,
     Round,
     contains,
@@ -68,6 +69,7 @@ from cg_sysid.jury import (
     share_explained,
 )
 from cg_sysid.landing_cause import with_landings
+from cg_sysid.late_samples import late_samples
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.race import RUNGS, Effects, Race
@@ -670,6 +672,14 @@ class _Search:
             o, (*self.train, *self.held), self.options.effects, self.carry_out
         )
 
+    def _late_samples(self, gains: Sequence[Gain]) -> str:
+        """That instants of sampling are not where their stamps say, in words."""
+        worst = max(gains, key=lambda g: g.before / g.noise)
+        body = self.nominal.mechanism
+        return late_samples(
+            (*self.train, *self.held), body.name, body.outputs, worst.channel, worst.unit
+        )
+
     def _less_mishaps(self, nominal: Outcome, final: Outcome) -> Outcome:
         """Without what happened in single records, if a number that differs explains more.
 
@@ -704,12 +714,14 @@ class _Search:
         verdict = verdict_of(causes, bool(left), share)
         gains = gains_of(self.nominal, self.held, nominal.held, final.held)
         reference = self.jury.judge(nominal, nominal, 0.0)
+        late = self._late_samples(gains) if verdict == 'unexplained' else ''
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
         return Diagnosis(
             verdict=verdict,
             summary=summary_of(
                 verdict, causes, gains, left, tuple(strained(nominal)), unmodelled,
                 self.options.effects, wandering, share,
+                late,
             ),
             causes=tuple(causes),
             gains=gains,
@@ -726,6 +738,7 @@ class _Search:
             ),
             unmodelled=unmodelled,
             wandering=wandering,
+            late=late,
         )  # fmt: skip
 
 

@@ -102,7 +102,8 @@ def work(options: argparse.Namespace) -> int:
     fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
     with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
         intake = take_in(
-            options.bags, model_file, note, options.torque, options.window, bars
+            options.bags, model_file, note, options.torque, options.window, bars,
+            options.use_anyway,
         )
         _same_mechanism(model, intake.records)
         origin = provenance(
@@ -144,6 +145,8 @@ def _command(options: argparse.Namespace) -> list[str]:
         ('--scheduler', options.scheduler),
     ):  # fmt: skip
         words += [] if value is None else [name, str(value)]
+    for finding in options.use_anyway:
+        words += ['--use-anyway', finding]
     if options.rounds != Options.rounds:
         words += ['--rounds', str(options.rounds)]
     return [*words, *options.bags]

@@ -141,6 +141,8 @@ class Diagnosis:
         landings: What the landings of a walking robot say; None where there are too few.
         wandering: A number that differs from recording to recording, where an error is left and
             one explains most of it.
+        late: What errors of timing make of an error that stays unexplained, as a sentence; empty
+            where there are none.
     """
 
     verdict: str
@@ -158,6 +160,7 @@ class Diagnosis:
     unmodelled: Unmodelled | None = None
     landings: Landings | None = None
     wandering: Wandering | None = None
+    late: str = ''
 
 
 @dataclass(frozen=True)
@@ -220,6 +223,7 @@ def summary_of(
     tried: Sequence[str] | None = None,
     wandering: Wandering | None = None,
     explained: float = 1.0,
+    late: str = '',
 ) -> str:
     """The answer in a few sentences.
 
@@ -233,6 +237,7 @@ def summary_of(
         tried: Effects that were tried; None for the whole library.
         wandering: A number that differs from recording to recording.
         explained: Share of the squared error above the noise that the causes take.
+        late: What errors of timing make of an error that stays unexplained, as a sentence.
     """
     if verdict == 'consistent':
         text = 'The model explains the records down to the noise of the sensors'
@@ -254,7 +259,7 @@ def summary_of(
                 f'goes with {listed([described(c) for c in causes])}, which may only stand in '
                 'for what is missing.'
             )
-        return text
+        return f'{text} {late}' if late else text
     named = ', '.join(described(c) for c in causes)
     if biggest.before < NO_GAIN * biggest.after and strained:
         text = (

@@ -62,7 +62,10 @@ def diagnosis_facts(
     ]
     counts = np.vstack([fit.count, diagnosis.extended.held.count])
     return plain({
-        **_head(DIAGNOSIS, diagnosis.verdict, diagnosis.summary, diagnosis.nominal),
+        **_head(
+            DIAGNOSIS, diagnosis.verdict, diagnosis.summary + _in_spite_of(intake),
+            diagnosis.nominal,
+        ),
         'causes': [_cause(cause, diagnosis.extended.model) for cause in diagnosis.causes],
         'gain': {
             g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in diagnosis.gains
@@ -78,6 +81,7 @@ def diagnosis_facts(
         },
         'unmodelled': _unmodelled(diagnosis),
         'wandering': _wandering(diagnosis),
+        'late_samples': diagnosis.late,
         'landings': _landings(diagnosis),
         'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
         **_fitted(diagnosis.nominal, fit),
@@ -99,12 +103,13 @@ def unusable_facts(
         provenance: See provenance.py.
     """
     return plain({
-        **_head(DIAGNOSIS, 'unusable', reason, model),
+        **_head(DIAGNOSIS, 'unusable', reason + _in_spite_of(intake), model),
         'causes': [],
         'gain': {},
         'remaining_error': {},
         'unmodelled': None,
         'wandering': None,
+        'late_samples': '',
         'landings': None,
         'ranking': [],
         'parameters': [
@@ -159,7 +164,7 @@ def identification_facts(
     )
     errors = [before.mse if before else np.full_like(fit.mse, np.nan), fit.mse]
     return plain({
-        **_head(IDENTIFICATION, 'identified', summary, model),
+        **_head(IDENTIFICATION, 'identified', summary + _in_spite_of(intake), model),
         'method': method,
         'causes': [],
         'gain': gain,
@@ -174,6 +179,7 @@ def identification_facts(
         },
         'unmodelled': None,
         'wandering': None,
+        'late_samples': '',
         'landings': None,
         'ranking': [],
         **_fitted(model, fit),
@@ -556,6 +562,17 @@ def _data(
             }
             for source in intake.sources
         ],
+        'overruled': [
+            {
+                'name': source.name,
+                'source': source.path,
+                'code': finding.code,
+                'where': finding.where,
+                'place': finding.place,
+                'reason': finding.message,
+            }
+            for source, finding in intake.overruled
+        ],
         'unusable': [
             {
                 'name': source.name,
@@ -567,6 +584,16 @@ def _data(
             for source in intake.left_out
         ],
     }
+
+
+def _in_spite_of(intake: Intake) -> str:
+    """That recordings are used which the check refuses, as a sentence; empty if there are none."""
+    if not intake.overruled:
+        return ''
+    names = sorted({source.name for source, _ in intake.overruled})
+    codes = sorted({finding.code for _, finding in intake.overruled})
+    which = names[0] if len(names) == 1 else f'{len(names)} recordings'
+    return f' {which} used in spite of what the check finds: {", ".join(codes)}.'
 
 
 def _coverage(model: Model, trial: Trial) -> Facts:

@@ -1,8 +1,8 @@
 """Findings: what a check of a recording says, as data, as JSON and as text."""
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +14,20 @@ COLOURS = {
     'info': 'cyan', 'warning': 'yellow', 'error': 'red',
     'good': 'green', 'warnings': 'yellow', 'unusable': 'red',
 }
+
+# Errors that a person may overrule, and why each makes a recording unusable. With what is not
+# here there is nothing left to use, or reading itself refuses the recording.
+OVERRULABLE = {
+    'clock_jump': 'time is wrong by an unknown amount from there on',
+    'dropped_samples': 'what drove the machine in the gap is not known, or stamps hide the gap',
+    'sampling_rate_change': 'the stamps do not know of it, so that time is wrong from there on',
+    'sensor_clipping': 'what is recorded at the limit is not the motion',
+    'sign_error': 'a fit would mirror the machine',
+    'spikes': 'more than a fit of squares can take',
+    'stuck': 'what is recorded there is not the motion',
+    'unit': 'numbers are wrong by a factor of 57.3',
+    'zero_shift': 'no one zero holds for the recording',
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -31,6 +45,8 @@ class Finding:
         value: What was found.
         allowed: What would have been right.
         repair: What reading does about it; empty if nothing. Part of the printed message.
+        overruled: It would be an error, but for a person who said that the recording is to be
+            used anyway.
     """
 
     code: str
@@ -43,11 +59,13 @@ class Finding:
     value: Any = None
     allowed: Any = None
     repair: str = ''
+    overruled: bool = False
 
     @property
     def text(self) -> str:
-        """The message, with the repair."""
-        return f'{self.message}; repaired: {self.repair}' if self.repair else self.message
+        """The message, with the repair, and that it was overruled."""
+        text = f'{self.message}; repaired: {self.repair}' if self.repair else self.message
+        return f'{text}; used anyway' if self.overruled else text
 
     @property
     def place(self) -> str:
@@ -79,6 +97,11 @@ class CheckReport:
             return 'unusable'
         return 'warnings' if 'warning' in severities else 'good'
 
+    @property
+    def overruled(self) -> tuple[Finding, ...]:
+        """The findings by which it would be unusable, had nobody overruled them."""
+        return tuple(finding for finding in self.findings if finding.overruled)
+
     def of(self, code: str) -> list[Finding]:
         """The findings of one code."""
         return [finding for finding in self.findings if finding.code == code]
@@ -104,6 +127,28 @@ class CheckReport:
                 f'[{COLOURS[f.severity]}]{f.severity}[/]', f.code, f.where, f.place, f.text
             )
         console.print(table)
+
+
+def overrulable(names: Iterable[str]) -> frozenset[str]:
+    """Names of findings that are to be overruled.
+
+    Raises:
+        ValueError: There is no such finding, or it cannot be overruled.
+    """
+    wanted = frozenset(names)
+    for name in sorted(wanted - set(OVERRULABLE)):
+        msg = f'use anyway: {name!r} is no finding that can be overruled; those that can: '
+        raise ValueError(msg + ', '.join(OVERRULABLE))
+    return wanted
+
+
+def overrule(findings: Iterable[Finding], names: frozenset[str]) -> Iterator[Finding]:
+    """Findings, errors of those names turned into warnings that say so."""
+    for finding in findings:
+        if finding.severity == 'error' and finding.code in names:
+            yield replace(finding, severity='warning', overruled=True)
+        else:
+            yield finding
 
 
 def make_report(name: str, findings: Iterable[Finding]) -> CheckReport:

@@ -67,7 +67,8 @@ def work(options: argparse.Namespace) -> int:
     only = tuple(n.strip() for n in options.only.split(',')) if options.only else None
     with Bars('cg identify', options.quiet) as bars:
         intake = take_in(
-            options.bags, model_file, note, options.torque, options.window, bars
+            options.bags, model_file, note, options.torque, options.window, bars,
+            options.use_anyway,
         )
         if not intake.records:
             first = intake.left_out[0]
@@ -110,6 +111,8 @@ def _command(options: argparse.Namespace) -> list[str]:
         ('--input', options.torque),
     ):  # fmt: skip
         words += [] if value is None else [name, str(value)]
+    for finding in options.use_anyway:
+        words += ['--use-anyway', finding]
     return [*words, *options.bags]
 
 

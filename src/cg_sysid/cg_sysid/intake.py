@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from cg_sysid.bags import no_bag, read_raw, to_record
 from cg_sysid.check import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.faults import FaultSignal, fault_signals
-from cg_sysid.findings import CheckReport, Finding, make_report
+from cg_sysid.findings import CheckReport, Finding, make_report, overrulable
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.record import Record
 
@@ -70,6 +70,14 @@ class Intake:
         return tuple(source for source in self.sources if source.reason)
 
     @property
+    def overruled(self) -> tuple[tuple[Source, Finding], ...]:
+        """What the check refuses in bags that are used all the same, because a person says so."""
+        return tuple(
+            (source, finding) for source in self.sources if not source.reason
+            for finding in source.check.overruled
+        )  # fmt: skip
+
+    @property
     def steps(self) -> dict[str, int]:
         """Name of a bag of a walking robot -> steps in it."""
         return dict(Counter(self.origin[landing.record.name] for landing in self.landings))
@@ -87,6 +95,7 @@ def take_in(
     torque: str | None = None,
     window: float | None = None,
     progress: Progress = lambda what, done, total: None,
+    use_anyway: Iterable[str] = (),
 ) -> Intake:
     """Read and check bags; broken ones are left out, with the reason.
 
@@ -97,19 +106,22 @@ def take_in(
         torque: `applied` or `command`; by default the applied torque where there is one.
         window: Cut records into windows of this length in s.
         progress: Called with (what, done, total).
+        use_anyway: Names of findings by which no bag is left out, as in `check_recording`.
 
     Raises:
+        ValueError: `use_anyway` names what cannot be overruled.
         RecordingError: A path is no bag at all, is given twice, or a window is too short.
     """
     if window is not None and not window >= SHORTEST_WINDOW:
         raise RecordingError(f'window is {window:g} s; at least {SHORTEST_WINDOW:g} s are needed')
+    anyway = overrulable(use_anyway)
     paths = _distinct(bags)
     sources: list[Source] = []
     records: list[Record] = []
     origin: dict[str, str] = {}
     for done, (name, path) in enumerate(paths.items()):
         progress('reading and checking bags', done, len(paths))
-        source, record = _take(name, path, model_file, note, torque)
+        source, record = _take(name, path, model_file, note, torque, anyway)
         sources.append(source)
         if record is None:
             continue
@@ -157,11 +169,12 @@ def _take(
     model_file: str | Path | None,
     note: Mapping[str, Any] | None,
     torque: str | None,
+    anyway: frozenset[str],
 ) -> tuple[Source, Record | None]:
     digest = bag_hash(path)
     try:
         raw = read_raw(path, note)
-        report = check_recording(raw, model_file)
+        report = check_recording(raw, model_file, use_anyway=anyway)
         record = None
         if report.verdict != 'unusable':
             record = to_record(raw, TORQUE_TOPICS[torque] if torque else None)

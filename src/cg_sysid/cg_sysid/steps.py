@@ -18,6 +18,9 @@ USUAL = 3.0  # distance over that around it, where the motion is rougher than pa
 AROUND = 3  # spans on each side that show what is usual, but 100 samples at least
 AGREE = 0.3  # distances of two spans differ by less than this share, and noise
 KNOCK_S = 0.02  # s within which two branches meet that a knock, or some bounces, part
+# A fit tells the zero of a recording to 0.3 to 0.6 mrad (docs/results.md): less cannot be seen.
+FINE = {'rad': 1e-3, 'm': 1e-4}
+FINE_SHARE = 1e-3  # of the motion: the torques that follow from an angle are off by no more, [1]
 HOLE = 1.8  # spacing over the usual one in which a motion may turn unseen, [1]
 
 
@@ -57,6 +60,7 @@ def find_step(
     quantum: float,
     spans: tuple[int, ...] = SPANS,
     knocks: bool = False,
+    timing: float = 0.0,
 ) -> Step | None:
     """The clearest step of a signal; None if there is none.
 
@@ -68,6 +72,7 @@ def find_step(
         spans: Samples on each side of an instant, in increasing order.
         knocks: The body may be knocked, as a foot that lands does: then branches of different
             rate that meet close by are no step.
+        timing: Error of the instants of sampling in s, root mean square, where one is known.
     """
     spacing = np.diff(time)
     usual = float(np.median(spacing))
@@ -82,6 +87,7 @@ def find_step(
         distance = _distance(sampled, span)
         least = CERTAIN * sigma * _spread(span) + ROUNDING * quantum + 1e-9 * np.ptp(values)
         least = least + CERTAIN * JITTER * moved
+        least = least + CERTAIN * (timing / usual) * moved * _spread(span)
         limit = np.maximum(least, USUAL * _usual(np.abs(distance), span))
         for k in holes:
             a, b = np.searchsorted(grid, [time[k], time[k + 1]])
@@ -105,6 +111,16 @@ def find_step(
         if not (knocks and _knocked(step)):
             return step
         agreed[max(0, best - spans[-1]) : best + spans[-1]] = 0.0
+
+
+def zero_known_to(values: np.ndarray, unit: str) -> float:
+    """How well the zero of an angle is known at best; a shift by less hurts no fit.
+
+    Args:
+        values: The angle.
+        unit: Its unit, rad or m.
+    """
+    return max(FINE[unit], FINE_SHARE * float(np.ptp(values)))
 
 
 def _knocked(step: Step) -> bool:

@@ -1,7 +1,9 @@
 """Checks: healthy recordings pass, each fault is found where it was put."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from rich.console import Console
 
 from cg_sysid import bags, check
 from cg_sysid.check import check_recording
+from cg_sysid.findings import OVERRULABLE
 from cg_sysid.synthetic import Synthesis, synthesise
 
 SAMPLES = 4000  # 8 s at 500 Hz
@@ -185,6 +188,97 @@ def test_a_sensor_that_dies_is_at_least_doubted(seed):
     report = check_recording(raw)
     assert [f for f in report.of('stuck') + report.of('still') if f.where == 'hip_angle']
     assert report.verdict != 'good'
+
+
+FREE = {'mechanism': 'double_pendulum', 'torque': 'zero', 'bandwidth': 1.0, 'amplitude': 1.5}
+
+
+def rounded_twice(values):
+    """Counts that a calibration curve has bent: no one quantum fits them."""
+    counts = 7e-4 * np.rint(values / 7e-4)
+    return counts + 4e-3 * np.sin(counts) + 2e-3 * np.cos(2.0 * counts)
+
+
+def half_precision(values):
+    return values.astype(np.float16).astype(float)
+
+
+def ended(values, share):
+    return np.minimum(values, np.quantile(values, share))
+
+
+def joints(raw, change):
+    values = raw.topics['/joint_states'].values
+    return edit(raw, '/joint_states', values={c: change(v) for c, v in values.items()})
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('rounding', [rounded_twice, half_precision])
+def test_equal_samples_where_a_free_swing_turns_are_no_end_of_the_sensor(rounding, seed):
+    raw = joints(synthesise(Synthesis(quantum=0.0, **FREE), seed), rounding)
+    assert not check_recording(raw).of('sensor_clipping')
+    # The sensor really ends, and the same rounding hides it no more.
+    for share in (0.97, 0.8):
+        short = joints(synthesise(Synthesis(quantum=0.0, **FREE), seed),
+                       lambda values, share=share: rounding(ended(values, share)))
+        assert check_recording(short).of('sensor_clipping')
+
+
+@pytest.mark.parametrize(('size', 'verdict'), [(1.5e-3, 'warnings'), (0.05, 'unusable')])
+def test_a_zero_shift_is_broken_only_where_it_is_larger_than_zeros_are_known(size, verdict):
+    raw = synthesise(Synthesis(quantum=0.0, noise=2e-5, **FREE), 1)
+    shifted = with_values(raw, '/joint_states', 'elbow_angle',
+                         lambda values: values + size * (INDEX > 2500))
+    report = check_recording(shifted)
+    assert [f.where for f in report.of('zero_shift')] == ['elbow_angle']
+    assert report.verdict == verdict
+
+
+def test_a_refusal_can_be_overruled_and_stays_in_the_report():
+    change, code, where, *_ = FAULTS['hip shift']
+    raw = change(synthesise(Synthesis(), 1))
+    assert check_recording(raw).verdict == 'unusable'
+    report = check_recording(raw, use_anyway=[code])
+    assert report.verdict == 'warnings'
+    assert [(f.code, f.where, f.severity) for f in report.overruled] == [(code, where, 'warning')]
+    assert report.overruled[0].text.endswith('used anyway')
+    # Another fault is none that was overruled, and what reading refuses cannot be.
+    assert check_recording(hip(frozen(1000, 1250))(raw), use_anyway=[code]).verdict == 'unusable'
+    with pytest.raises(ValueError, match=r'not_finite.*sensor_clipping'):
+        check_recording(raw, use_anyway=['not_finite'])
+
+
+def test_the_command_line_overrules_and_lists_what_can_be(tmp_path, capsys):
+    values = synthesise(Synthesis(duration=2.0), 0)
+    record = bags.to_record(with_values(
+        values, '/hip_encoder', 'hip_angle', lambda v: v + 0.05 * (np.arange(len(v)) > 500)))
+    path = str(bags.write_bag(tmp_path / 'shifted', record))
+    assert check.main([path]) == 1
+    capsys.readouterr()
+    assert check.main([path, '--use-anyway', 'stuck', '--use-anyway', 'zero_shift', '--json']) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert [f['code'] for f in report['findings'] if f['overruled']] == ['zero_shift']
+    assert check.main([path, '--use-anyway', 'shift']) == 2
+    error = capsys.readouterr().err
+    assert "'shift'" in error
+    assert all(name in error for name in OVERRULABLE)
+
+
+def test_every_code_is_documented():
+    text = (Path(__file__).parents[3] / 'docs' / 'data.md').read_text(encoding='utf-8')
+    table = text.split('## Check')[1].split('\n## ')[0]
+    rows = [line.split('|')[1] for line in table.splitlines() if line.startswith('| `')]
+    listed = {code for row in rows for code in re.findall(r'`(\w+)`', row)}
+    sources = Path(check.__file__).parent
+    modules = ['check', 'clock', 'check_jitter', 'intake', *(
+        p.stem for p in sources.glob('check_*.py'))]
+    written = set()
+    for module in modules:
+        source = (sources / f'{module}.py').read_text(encoding='utf-8')
+        written |= set(re.findall(r"Finding\(\s*'(\w+)'", source))
+    written |= {'sign_error', 'sampling_rate_change', 'dropped_samples'}  # of check_dynamics
+    assert listed == written
+    assert set(OVERRULABLE) <= listed
 
 
 def test_an_encoder_between_tied_legs_may_rest():

@@ -9,13 +9,17 @@ import pytest
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
 from cg_sysid import spoil
 from cg_sysid.bags import read_bag, to_record, write_bag
 from cg_sysid.check import check_recording
+from cg_sysid.diagnosis_file import unusable_facts
 from cg_sysid.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments import load_experiment
 from cg_sysid.intake import take_in
 from cg_sysid.rehearse import rehearse
+from cg_sysid.report.page import render
+from cg_sysid.synthetic import Synthesis, synthesise
 
 MODEL = model_path('compass_gait_mit')
 SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',
@@ -240,3 +244,63 @@ def test_a_fault_in_a_bag_is_told_where_the_bag_is_taken_in(tmp_path):
     used = next(source for source in intake.sources if source.name == 'jumped')
     assert {f.code for f in used.check.findings if f.repair} == {'clock_jump'}
     np.testing.assert_array_equal(read_bag(paths[1]).stamp_ns, record.stamp_ns)
+
+
+@pytest.mark.parametrize(('gap', 'verdict'), [(0.02, 'warnings'), (0.005, 'unusable')])
+def test_a_step_within_the_play_of_the_model_is_odd_only(sound, tmp_path, gap, verdict):
+    path = tmp_path / 'play.yaml'
+    Model.load(MODEL).with_effect('backlash', gap=gap).save(path)
+    raw = spoil.shifted('hip_angle', 0.01, AT)(sound['spring_stabilised_outer'])
+    report = check_recording(raw, path)
+    assert {f.where for f in report.of('zero_shift')} == {'hip_angle'}
+    assert report.verdict == verdict
+
+
+def test_a_joint_at_rest_may_slip_as_far_as_friction_allows():
+    # The pendulum rests within 18 mrad (docs/results.md); this one slips between two samples.
+    time = np.arange(4000) / 500.0
+    swing = 0.5 * np.sin(4.0 * time) * np.clip(time - 5.0, 0.0, 1.0) ** 3
+    for size, verdict in ((0.012, 'warnings'), (0.03, 'unusable')):
+        raw = synthesise(Synthesis(mechanism='pendulum', quantum=0.0, noise=1e-4), 0)
+        states = raw.topics['/joint_states']
+        noise = 1e-4 * np.random.default_rng(0).standard_normal(len(time))
+        moved = swing + noise + size * (time > 3.0)
+        topics = {**raw.topics, '/joint_states': replace(states, values={'angle': moved})}
+        report = check_recording(replace(raw, topics=topics), model_path('sydney_pendulum'))
+        assert {f.where for f in report.of('zero_shift')} == {'angle'}
+        assert report.verdict == verdict
+
+
+def test_a_joint_that_turns_is_none_that_rests():
+    # Friction would let the hip rest 97 mrad off, but where it turns it does not rest.
+    def torque(time):
+        return 6.0 * np.sin(2 * np.pi * (0.7 + 0.2 * time) * time)
+
+    record = rehearse('turns', Model.load(MODEL), Setup('inner', 'inner_fixed'), [0.25, 0.5],
+                      [torque], 3.0, 0.004, 1)
+    shifted = replace(record, outputs={
+        **record.outputs, 'hip_angle': record.outputs['hip_angle'] + 0.03 * (record.time > 1.5)})
+    report = check_recording(spoil.as_recorded(shifted, 1), MODEL)
+    assert {f.where for f in report.of('zero_shift')} == {'hip_angle'}
+    assert report.verdict == 'unusable'
+
+
+def test_a_bag_that_is_used_anyway_is_told_in_answer_and_report(tmp_path):
+    record = record_of(machine_of(), 'spring_stabilised_outer', 3)
+    shifted = replace(record, outputs={
+        **record.outputs, 'imu_angle': record.outputs['imu_angle'] + 0.005 * (record.time > AT),
+    })
+    path = write_bag(tmp_path / 'shifted', shifted)
+    intake = take_in([path], MODEL, use_anyway=['zero_shift'])
+    assert not intake.left_out
+    assert len(intake.records) == 1
+    facts = unusable_facts(Model.load(MODEL), intake, 'Too few.', {'options': {}})
+    (entry,) = facts['overruled']
+    assert (entry['name'], entry['code'], entry['where']) == ('shifted', 'zero_shift', 'imu_angle')
+    said = 'shifted used in spite of what the check finds: zero_shift.'
+    assert facts['summary'] == f'Too few. {said}'
+    page = render(facts, [])
+    assert 'Used anyway' in page
+    assert 'imu_angle 3.2' in page
+    with pytest.raises(ValueError, match='shift'):
+        take_in([path], MODEL, use_anyway=['shift'])

@@ -41,6 +41,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
         _faults(facts, drawn),
         _where(facts),
         _left_out(facts),
+        _overruled(facts),
     ]
     left = [part for part in left if part is not None]
     right = [part for part in (gain(facts),) if part is not None]
@@ -176,6 +177,21 @@ def _left_out(facts: Facts) -> Markup | None:
         [tag('div', tag('b', u['name']), tag('p', u['reason']), class_='fault')
          for u in facts['unusable']],
         class_='card',
+    )  # fmt: skip
+
+
+def _overruled(facts: Facts) -> Markup | None:
+    if not facts.get('overruled'):
+        return None
+    return tag('div',
+        tag('h3', 'Used anyway'),
+        tag('p', 'The check refuses these recordings; they are used because it was overruled.',
+            class_='soft'),
+        [tag('div', tag('b', f'{entry["name"]}: {entry["code"]}'),
+             tag('p', ' '.join(w for w in (entry['where'], entry['place'], entry['reason']) if w)),
+             class_='fault')
+         for entry in facts['overruled']],
+        class_='card', id='overruled',
     )  # fmt: skip
 
 

@@ -107,7 +107,8 @@ def lead(facts: Facts) -> str:
             f' {sentence(listed(names))} {"takes" if len(names) == 1 else "take"} less than half '
             'of the error, and may only stand in for what is missing.'
         )
-    return text
+    late = facts.get('late_samples')
+    return f'{text} {late}' if late else text
 
 
 def _nothing_tried(facts: Facts) -> str:
