@@ -27,7 +27,6 @@ from scipy.integrate import solve_ivp
 
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import FLAGS as BATCH_FLAGS
 from cg_dynamics.batch import batch_source, simulate_batch
 from cg_dynamics.c_compiler import build, compiler
 from cg_dynamics.compiled import CompiledModel, assemble, compile_model, sources
@@ -70,7 +69,7 @@ def batch_route() -> Route:
 
 def machine_route() -> Route:
     c = compile_model(MODEL, SETUP)
-    interpreted = CompiledModel(c.equations, c.free, None)
+    interpreted = CompiledModel(c.equations, c.free, native=False)
     u = TORQUE[:, None]
     return ROWS - 1, lambda: interpreted.simulate(TIME, u, START, P)[-1]
 

@@ -29,7 +29,7 @@ from cg_control.rollouts import Outcome, Rollouts, follow
 from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tree import Tree
-from cg_dynamics.batch import WIDTH
+from cg_dynamics.vector_code import WIDTH
 from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 

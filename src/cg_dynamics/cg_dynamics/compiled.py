@@ -1,31 +1,28 @@
 """Compiled models: CasADi expressions to C, built once, cached by content, called on arrays.
 
-The generated functions and rollout.c become one shared library per model structure and set-up;
-parameter values are arguments, so a fit never compiles. Where no C compiler is found the same
+Rollouts of a model structure in a set-up are machine code (rollout.py); parameter values are
+arguments, so a fit never compiles. Where no C compiler is found the same
 interface runs on CasADi's virtual machine (fallback.py), slower, and says so once.
 """
 
-import ctypes
 import logging
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
-from cg_dynamics.c_compiler import compiler, object_file, shared_library
+from cg_dynamics.c_compiler import compiler
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.fallback import EASY, HALVINGS, STABLE, STATE_LIMIT, InterpretedRollout
+from cg_dynamics.fallback import InterpretedRollout
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout import NativeRollout, symbols_of
 
 log = logging.getLogger(__name__)
 
-MAX_COLUMNS = 64
-WORK = 256  # numbers by which work space grows, so that models share rollouts
 REFERENCE_STEP = 0.002
 TOLERANCE = 3e-7  # error of a step in units of the state scales; play multiplies it
 SMALLEST_STEP = 1e-4
@@ -35,7 +32,7 @@ STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstab
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of one record: see cgm_normal in rollout.c.
+    """Normal equations of one record (NativeRollout.cgm_normal).
 
     Attributes:
         hessian: Sum of J'WJ, shape (nc, nc).
@@ -75,9 +72,12 @@ class CompiledModel:
     Attributes:
         equations: The symbolic equations.
         free: Names of the parameters with sensitivities, in the order of `column`.
+
+    Args:
+        native: To machine code; else for CasADi's virtual machine.
     """
 
-    def __init__(self, equations: Equations, free: tuple[str, ...], library: Path | None):
+    def __init__(self, equations: Equations, free: tuple[str, ...], native: bool = True):
         self.equations = equations
         self.free = free
         self.state_names = equations.state_names
@@ -89,7 +89,7 @@ class CompiledModel:
         self.np, self.ny = equations.p.shape[0], equations.outputs.shape[0]
         e = equations
         self.largest_step = min(e.largest_step, REFERENCE_STEP)
-        free_symbols = _pick(e, free)
+        free_symbols = symbols_of(e, free)
         delays = ca.vertcat(e.input_delay, e.output_delays)
         self._delays = ca.Function('delays', [e.p], [delays, ca.jacobian(delays, free_symbols)])
         self._initial = ca.Function(
@@ -101,10 +101,7 @@ class CompiledModel:
         self.h = ca.Function('h', [e.x, e.u, e.p], [e.outputs], ['x', 'u', 'p'], ['y'])
         self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], [ca.jacobian(e.rates, e.x)])
         self.has_delays = not delays.is_zero()
-        if library is None:
-            self._c: Any = InterpretedRollout(equations, free)
-        else:
-            self._c = _bind(library)
+        self._c: Any = (NativeRollout if native else InterpretedRollout)(equations, free)
 
     def delays(self, p: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Input delay in s, output delays in s (ny,), and their Jacobian (1 + ny, nf)."""
@@ -250,7 +247,7 @@ class CompiledModel:
         states = np.empty((n, self.nx))
         inputs = _array(rows.inputs)
         done = self._c.cgm_simulate(
-            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states
+            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states, None
         )
         if done < n:
             raise SimulationError(
@@ -303,8 +300,6 @@ class CompiledModel:
         """
         time, u, x0, p = self._checked(time, u, x0, p)
         n, nc = len(time), np.shape(s0)[1]
-        if nc > MAX_COLUMNS:
-            raise ValueError(f'{nc} unknowns in one record; at most {MAX_COLUMNS}')
         s0 = _shaped('s0', s0, (self.nx, nc))
         measured = _shaped('measured', measured, (n, self.ny))
         weight = _shaped('weight', weight, (self.ny,))
@@ -317,8 +312,6 @@ class CompiledModel:
         if column.shape != (len(self.free),) or column.max(initial=-1) >= nc:
             raise ValueError(f'column must place {len(self.free)} parameters below {nc}')
         delay_columns = [_delay_column(row, column) for row in jacobian]
-        any_late = self.has_delays and (output_delays.any() or max(delay_columns[1:]) >= 0)
-        history = np.empty(m * 2 * self.nx * (1 + nc) if any_late else 1)
         normal = Normal(
             np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0
         )
@@ -327,7 +320,7 @@ class CompiledModel:
         done = self._c.cgm_normal(
             m, rows.time, *_accuracy(refinement), _array(rows.inputs), _array(rows.slope),
             delay_columns[0], x0, s0, p, nc, column, samples, weight,
-            _array(output_delays), np.array(delay_columns[1:], dtype=np.int32), history,
+            _array(output_delays), np.array(delay_columns[1:], dtype=np.int32),
             normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
         )  # fmt: skip
         object.__setattr__(normal, 'rows', int(np.searchsorted(rows.recorded, done)))
@@ -411,11 +404,6 @@ def _shaped(name: str, a, shape: tuple[int, ...]) -> np.ndarray:
     return a
 
 
-def _pick(equations: Equations, names: tuple[str, ...]) -> ca.SX:
-    where = [equations.parameter_names.index(name) for name in names]
-    return ca.vertcat(*(equations.p[i] for i in where)) if where else ca.SX(0, 1)
-
-
 def _delay_column(row: np.ndarray, column: np.ndarray) -> int:
     # A delay is the sum of delays of effects; two of them on one path are not told apart here.
     active = [int(c) for value, c in zip(row, column, strict=True) if value != 0 and c >= 0]
@@ -426,90 +414,5 @@ def _build(model: Model, setup: Setup, free: tuple[str, ...]) -> CompiledModel:
     equations = assemble(model, setup)
     if compiler() is None:
         log.warning('no C compiler found: models run on the CasADi virtual machine, slower')
-        return CompiledModel(equations, free, None)
-    return CompiledModel(equations, free, library_of(equations, free))
-
-
-def library_of(e: Equations, free: tuple[str, ...]) -> Path:
-    """The shared library of equations and their sensitivities to some parameters."""
-    functions, rollouts = sources(e, free)
-    return shared_library(functions, objects=[object_file(rollouts)])
-
-
-def sources(e: Equations, free: tuple[str, ...]) -> tuple[str, str]:
-    """C of a model's functions and their derivatives, and of the rollouts that call them."""
-    symbols = _pick(e, free)
-    arguments = [e.x, e.u, e.p]
-
-    def dense(matrix):  # row-major
-        return ca.densify(matrix).T
-
-    def function(name, *results):
-        return ca.Function(name, arguments, list(ca.cse([ca.densify(r) for r in results])))
-
-    functions = [
-        function('cgm_f', e.rates),
-        function(
-            'cgm_fs',
-            e.rates,
-            dense(ca.jacobian(e.rates, e.x)),
-            dense(ca.jacobian(e.rates, e.u)),
-            dense(ca.jacobian(e.rates, symbols)),
-        ),
-        function('cgm_h', e.outputs),
-        function(
-            'cgm_hs',
-            e.outputs,
-            dense(ca.jacobian(e.outputs, e.x)),
-            dense(ca.jacobian(e.outputs, symbols)),
-        ),
-    ]
-    generator = ca.CodeGenerator('cgm', {'with_header': False})
-    for item in functions:
-        generator.add(item)
-    return generator.dump(), _rollouts(e, free, max(item.sz_w() for item in functions))
-
-
-def _rollouts(e: Equations, free: tuple[str, ...], work: int) -> str:
-    """rollout.c for functions of these sizes: many models have the same, and share its object."""
-    given = {
-        'NX': e.x.shape[0],
-        'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
-        'NU': e.u.shape[0],
-        'NP': e.p.shape[0],
-        'NF': len(free),
-        'NY': e.outputs.shape[0],
-        'W': WORK * (work // WORK + 1),
-        'MAX_COLUMNS': MAX_COLUMNS,
-        'STATE_LIMIT': STATE_LIMIT,
-        'HALVINGS': HALVINGS,
-        'STABLE': STABLE,
-        'EASY': EASY,
-    }
-    defines = '\n'.join(f'#define {name} {value}' for name, value in given.items())
-    runtime = (Path(__file__).parent / 'rollout.c').read_text()
-    return f'{defines}\n{runtime}'
-
-
-def _bind(library: Path) -> ctypes.CDLL:
-    loaded = ctypes.CDLL(str(library))
-    number, count = ctypes.c_double, ctypes.c_int
-    array = np.ctypeslib.ndpointer(float, flags='C')
-    whole = np.ctypeslib.ndpointer(np.int32, flags='C')
-
-    class OptionalArray(array):  # type: ignore[misc, valid-type]
-        @classmethod
-        def from_param(cls, value):
-            return None if value is None else super().from_param(value)
-
-    maybe = OptionalArray
-    loaded.cgm_advance.argtypes = [array, array, array, number, count]
-    loaded.cgm_advance.restype = None
-    loaded.cgm_simulate.argtypes = [count, array, number, number, array, array, array, array]
-    loaded.cgm_outputs.argtypes = [count, array, array, array, array, array, array]
-    loaded.cgm_outputs.restype = None
-    loaded.cgm_normal.argtypes = [
-        count, array, number, number, array, array, count, array, array, array, count, whole,
-        array, array, array, whole, array, array, array, array, array, maybe, maybe,
-    ]  # fmt: skip
-    return loaded
+        return CompiledModel(equations, free, native=False)
+    return CompiledModel(equations, free)

@@ -47,7 +47,7 @@ class InterpretedRollout:
         if n:
             x[:] = path[:, -1]
 
-    def cgm_simulate(self, n: int, dt, largest: float, tolerance: float, u, x0, p, X) -> int:
+    def cgm_simulate(self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, halved) -> int:
         """States at all rows; the number of rows before the state ran away."""
         path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, None)
         X[:] = path[row]
@@ -65,7 +65,7 @@ class InterpretedRollout:
 
     def cgm_normal(
         self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
-        weight, delay, delay_to, history, H, g, sse, count, Y, Jacobian,
+        weight, delay, delay_to, H, g, sse, count, Y, Jacobian,
     ) -> int:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
         nx, ny = self.nx, self.ny

@@ -6,11 +6,12 @@ import pytest
 
 from cg_dynamics import batch as module
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import Feedback, UnsupportedError, batch_library, simulate_batch
+from cg_dynamics.batch import Feedback, batch_library, simulate_batch
 from cg_dynamics.c_compiler import compiler
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.rig import Setup
+from cg_dynamics.vector_code import UnsupportedError, vector_code
 
 TIME = np.arange(0, 0.2, 0.002)
 FOURTH = -(-len(LIBRARY) // 4)
@@ -198,4 +199,4 @@ def test_operation_without_vector_form_is_named():
     x, u, p = ca.SX.sym('x'), ca.SX.sym('u'), ca.SX.sym('p')
     f = ca.Function('odd', [x, u, p], [ca.erf(x)])
     with pytest.raises(UnsupportedError, match="of 'odd'"):
-        module._vector_form(f)
+        vector_code(f, 'odd', 'prepare')

@@ -162,7 +162,7 @@ def test_sensitivities_as_time_goes_on(bare, name, values, backend):
     own = [f'{name}.{key}' for key in values if key != 'transition_rate']
     compiled = compile_model(model, Setup())
     if backend == 'interpreted':
-        compiled = CompiledModel(compiled.equations, compiled.free, None)
+        compiled = CompiledModel(compiled.equations, compiled.free, native=False)
     u, p = inputs_of(model, Setup()), parameter_vector(model, Setup())
     # Nearly at rest, so that the joint turns back and bristles bend the other way.
     motion = np.array([0.05, 0.12, 0.02, 0.0])

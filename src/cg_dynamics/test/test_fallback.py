@@ -32,7 +32,7 @@ def pair(request, bare, springs):
         model = model.with_effect(name, **values)
     setup = Setup(springs=springs)
     c = compile_model(model, setup)
-    return c, CompiledModel(c.equations, c.free, None), parameter_vector(model, setup)
+    return c, CompiledModel(c.equations, c.free, native=False), parameter_vector(model, setup)
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_runaway_is_found_at_the_same_row(bare):
     p = parameter_vector(bare, Setup())
     compiled = compile_model(bare, Setup())
     times = []
-    for route in (compiled, CompiledModel(compiled.equations, compiled.free, None)):
+    for route in (compiled, CompiledModel(compiled.equations, compiled.free, native=False)):
         with pytest.raises(SimulationError) as caught:
             route.simulate(time, torque, np.zeros(4), p)
         times.append(caught.value.time)

@@ -179,7 +179,7 @@ def test_sensitivities_are_derivatives(bare, name, backend):
     own = [f'{label}.{q.name}' for q in UNMODELLED[name].parameters if q.free][-3:]
     compiled = compile_model(model, SETUP)
     if backend == 'interpreted':
-        compiled = CompiledModel(compiled.equations, compiled.free, None)
+        compiled = CompiledModel(compiled.equations, compiled.free, native=False)
     u, p = inputs(compiled), parameter_vector(model, SETUP)
     column = np.full(len(compiled.free), -1)
     places = [compiled.free.index(parameter) for parameter in own]
