@@ -29,9 +29,11 @@ from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.batch import batch_source, simulate_batch
 from cg_dynamics.c_compiler import build, compiler
-from cg_dynamics.compiled import CompiledModel, assemble, compile_model, sources
+from cg_dynamics.compiled import CompiledModel, assemble, compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout import states_source, windows_source
+from cg_dynamics.vector_code import FLAGS
 
 STEP = 0.002
 ROWS = 501
@@ -261,18 +263,19 @@ def build_times() -> dict[str, float]:
     c = compile_model(model, SETUP)
     found = {}
     start = cpu_time()
-    functions, rollouts = sources(assemble(model, SETUP), c.free)
+    equations = assemble(model, SETUP)
+    states, windows = states_source(equations), windows_source(equations, c.free)
     found['equations and C source'] = cpu_time() - start
     if compiler() is not None:
         with tempfile.TemporaryDirectory() as directory:
-            start, shared = cpu_time(), Path(directory) / 'rollouts.o'
-            build(rollouts, shared)
-            found['C compiler, rollouts that models of the same sizes share'] = cpu_time() - start
             start = cpu_time()
-            build(functions, Path(directory) / 'a.so', objects=[shared])
-            found['C compiler, with sensitivities'] = cpu_time() - start
+            build(states, Path(directory) / 'a.so', FLAGS)
+            found['C compiler, rollouts'] = cpu_time() - start
             start = cpu_time()
-            build(batch_source(c), Path(directory) / 'b.so', BATCH_FLAGS)
+            build(windows, Path(directory) / 'w.so', FLAGS)
+            found['C compiler, sensitivities'] = cpu_time() - start
+            start = cpu_time()
+            build(batch_source(c), Path(directory) / 'b.so', FLAGS)
             found['C compiler, batch'] = cpu_time() - start
     return found
 

@@ -44,10 +44,10 @@ from cg_control.preview import LANDING, Preview
 from cg_control.routes import UPRIGHT, Routes
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
-from cg_dynamics.vector_code import WIDTH
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_dynamics.settings import setting
+from cg_dynamics.vector_code import WIDTH
 
 FOLLOWING, OUTSIDE = 'following', 'outside'
 KEPT = 5000  # look-ups whose time is remembered

@@ -23,7 +23,6 @@ from cg_control.friction import friction_parameters, friction_torque
 from cg_control.nodes import Nodes, Way, triangles
 from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
-from cg_dynamics.vector_code import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 from cg_dynamics.c_compiler import compiler, shared_library
 from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.contact import contact_law
@@ -34,6 +33,7 @@ from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.vector_code import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
 
 log = logging.getLogger(__name__)
 

@@ -20,6 +20,7 @@ from cg_dynamics.fallback import InterpretedRollout
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout import NativeRollout, symbols_of
+from cg_dynamics.vector_code import UnsupportedError
 
 log = logging.getLogger(__name__)
 
@@ -415,4 +416,8 @@ def _build(model: Model, setup: Setup, free: tuple[str, ...]) -> CompiledModel:
     if compiler() is None:
         log.warning('no C compiler found: models run on the CasADi virtual machine, slower')
         return CompiledModel(equations, free, native=False)
-    return CompiledModel(equations, free)
+    try:
+        return CompiledModel(equations, free)
+    except UnsupportedError as error:
+        log.warning('the model runs on the CasADi virtual machine, slower: %s', error)
+        return CompiledModel(equations, free, native=False)

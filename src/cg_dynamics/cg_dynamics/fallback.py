@@ -3,7 +3,7 @@
 One Runge-Kutta step of the state, and one of the variational equations by all initial states, all
 free parameters and the delay, are CasADi functions; `mapaccum` chains them over a chunk of steps.
 The sensitivities that a caller asks for follow by the chain rule. Arguments and results are
-those of the functions in rollout.c, arrays that are filled included.
+those of NativeRollout, arrays that are filled included.
 """
 
 import functools
@@ -22,7 +22,7 @@ EASY = 0.03  # of the tolerance: a step of fourth order twice as long errs 16 ti
 
 
 class InterpretedRollout:
-    """The functions of rollout.c for one set of equations.
+    """The functions of NativeRollout for one set of equations.
 
     Args:
         equations: The model.
@@ -38,7 +38,7 @@ class InterpretedRollout:
         self._f = ca.Function('f', [e.x, e.u, e.p], [e.rates])
         self._h = ca.Function('h', [e.x, e.u, e.p], [e.outputs])
 
-    # --- the interface of rollout.c ---------------------------------------------------------
+    # --- the interface of NativeRollout -----------------------------------------------------
 
     def cgm_advance(self, x, u, p, h: float, n: int) -> None:
         """N Runge-Kutta steps of h seconds, in place."""
@@ -47,7 +47,9 @@ class InterpretedRollout:
         if n:
             x[:] = path[:, -1]
 
-    def cgm_simulate(self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, halved) -> int:
+    def cgm_simulate(
+        self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, halved
+    ) -> int:
         """States at all rows; the number of rows before the state ran away."""
         path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, None)
         X[:] = path[row]
