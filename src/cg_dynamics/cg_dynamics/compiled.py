@@ -248,7 +248,7 @@ class CompiledModel:
         states = np.empty((n, self.nx))
         inputs = _array(rows.inputs)
         done = self._c.cgm_simulate(
-            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states, None
+            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states, 0, None
         )
         if done < n:
             raise SimulationError(

@@ -48,7 +48,7 @@ class InterpretedRollout:
             x[:] = path[:, -1]
 
     def cgm_simulate(
-        self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, halved
+        self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, most, steps
     ) -> int:
         """States at all rows; the number of rows before the state ran away."""
         path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, None)

@@ -93,7 +93,7 @@ static double error_of(const vd *x, const vd *y, const vd *k4, const vd *u, cons
 typedef struct {
     int halved; /* times, from row to row */
     int done;   /* smallest steps of this interval */
-    int most;   /* halvings of a step that stood, since it was set to 0 */
+    unsigned steps; /* a bit for each smallest step at which one of this interval began */
 } Pace;
 
 static const int WHOLE = 1 << HALVINGS;
@@ -106,8 +106,8 @@ static int stands(Pace *pace, double error)
         pace->halved++;
         return 0;
     }
+    pace->steps |= 1u << pace->done;
     pace->done += length;
-    if (pace->halved > pace->most) pace->most = pace->halved;
     if (error < EASY && pace->halved > 0 && pace->done % (2 * length) == 0) pace->halved--;
     return 1;
 }
@@ -116,6 +116,7 @@ static int stands(Pace *pace, double error)
 static void follow(vd *x, const vd *u, const vd *s, double h, double tolerance, Pace *pace)
 {
     vd y[NX], k4[NX];
+    pace->steps = 0;
     for (pace->done = 0; pace->done < WHOLE;) {
         const double part = h / (1 << pace->halved);
         step(x, u, s, part, y, k4);
@@ -123,10 +124,11 @@ static void follow(vd *x, const vd *u, const vd *s, double h, double tolerance, 
     }
 }
 
-/* States at all rows, X (n, NX), and how often their steps were halved, halved (n) if not null.
-   Returns the number of rows before the state ran away. */
+/* States at all rows, X (n, NX), and the steps that led there (Pace), steps (n, most) if not null,
+   where no row takes more than `most` intervals. Returns the number of rows before the state ran
+   away. */
 int cgm_simulate(int n, const double *dt, double largest, double tolerance, const double *inputs,
-                 const double *x0, const double *p, double *X, int *halved)
+                 const double *x0, const double *p, double *X, int most, int *steps)
 {
     Pace pace = {0};
     vd s[SHARED + 1], x[NX], u[NU];
@@ -136,9 +138,10 @@ int cgm_simulate(int n, const double *dt, double largest, double tolerance, cons
     for (int k = 0; k + 1 < n; k++) {
         const int m = steps_of(dt[k], largest);
         splat(NU, inputs + k * NU, u);
-        pace.most = 0;
-        for (int i = 0; i < m; i++) follow(x, u, s, dt[k] / m, tolerance, &pace);
-        if (halved) halved[k] = pace.most;
+        for (int i = 0; i < m; i++) {
+            follow(x, u, s, dt[k] / m, tolerance, &pace);
+            if (steps && i < most) steps[k * most + i] = (int)pace.steps;
+        }
         first_lane(NX, x, X + (k + 1) * NX);
         if (!sane(X + (k + 1) * NX)) return k + 1;
     }

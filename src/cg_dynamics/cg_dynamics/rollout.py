@@ -1,7 +1,7 @@
 """Rollouts of one model in machine code: rollout.c for its states, windows.c for sensitivities.
 
 A rollout is simulated once, step by step. Its sensitivities obey linear equations along it, so
-that eight windows of it are integrated side by side in the lanes of one register and chained:
+that eight windows of it are integrated side by side in the lanes of one register and chained, by the very steps that the rollout took:
 
     S(t) = Phi_w(t) S(t_w) + Gamma_w(t)      for t in window w, which begins at t_w
 
@@ -85,8 +85,10 @@ class NativeRollout:
             Number of rows before the state ran away.
         """
         states = np.empty((n, self.nx))
-        halved = np.zeros(n, np.int32)
-        done = self.cgm_simulate(n, np.diff(time), largest, tolerance, u, x0, p, states, halved)
+        rows = np.diff(time)
+        most = max(1, int(np.ceil(rows.max(initial=0.0) / largest)))
+        steps = np.zeros((n, most), np.int32)
+        done = self.cgm_simulate(n, rows, largest, tolerance, u, x0, p, states, most, steps)
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time, u, p, states, delay, y)
         residual = y - measured[:done]
@@ -116,7 +118,8 @@ class NativeRollout:
         by_lane = None if Jacobian is None else np.zeros((n, self.ny, k))
         if not kernel(
             lanes.first, lanes.length, lanes.start, lanes.until, lanes.handed, time, largest,
-            u, du, p, k, place, lanes.late, states, halved, residual, there * weight, delay,
+            u, du, p, k, place, lanes.late, states, most, steps, residual, there * weight,
+            delay,
             np.array([own_delay.get(c, -1) for c in delay_to], np.int32), hessian, gradient,
             handed, by_lane,
         ):  # fmt: skip
@@ -133,10 +136,9 @@ class NativeRollout:
         g += np.einsum('wkc,wk->c', chain, gradient[used])
         if Jacobian is not None and by_lane is not None:
             for w in range(lanes.count):
-                rows = slice(
-                    lanes.first[w] + lanes.start[w], lanes.first[w] + lanes.until[w]
-                )
-                Jacobian[rows] = by_lane[rows] @ chain[w]
+                first = lanes.first[w]
+                judged = slice(first + lanes.start[w], first + lanes.until[w])
+                Jacobian[judged] = by_lane[judged] @ chain[w]
         return n
 
 
@@ -333,7 +335,8 @@ def _bind(library: Path) -> ctypes.CDLL:
     loaded.cgm_advance.argtypes = [_ARRAY, _ARRAY, _ARRAY, _NUMBER, _COUNT]
     loaded.cgm_advance.restype = None
     loaded.cgm_simulate.argtypes = [
-        _COUNT, _ARRAY, _NUMBER, _NUMBER, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _optional(_WHOLE),
+        _COUNT, _ARRAY, _NUMBER, _NUMBER, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _COUNT,
+        _optional(_WHOLE),
     ]  # fmt: skip
     loaded.cgm_outputs.argtypes = [_COUNT, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY]
     loaded.cgm_outputs.restype = None
@@ -343,7 +346,8 @@ def _bind(library: Path) -> ctypes.CDLL:
 def _bind_windows(library: Path):
     loaded = ctypes.CDLL(str(library))
     loaded.cgw_normal.argtypes = [
-        *[_WHOLE] * 5, _ARRAY, _NUMBER, *[_ARRAY] * 3, _COUNT, _WHOLE, _COUNT, _ARRAY, _WHOLE,
+        *[_WHOLE] * 5, _ARRAY, _NUMBER, *[_ARRAY] * 3, _COUNT, _WHOLE, _COUNT, _ARRAY, _COUNT,
+        _WHOLE,
         *[_ARRAY] * 3, _WHOLE, *[_ARRAY] * 3, _optional(_ARRAY),
     ]  # fmt: skip
     return loaded.cgw_normal

@@ -26,32 +26,41 @@ static int steps_of(double dt, double largest)
     return n < 1 ? 1 : n;
 }
 
-static double most(vd x)
+/* The length of a step from `done` on, in smallest steps, where the bits of `steps` say where steps
+   begin. */
+static int length_of(unsigned steps, int done)
 {
-    double found = x[0];
-    for (int j = 1; j < WIDTH; j++) found = x[j] > found ? x[j] : found;
-    return found;
+    int length = 1;
+    while (done + length < WHOLE && !(steps >> (done + length) & 1)) length++;
+    return length;
 }
 
-/* h seconds of the state and its sensitivities in place, in 2^halved parts, or more where a
-   sensitivity would be unstable at a state that rests. */
+/* h seconds of the state and its sensitivities in place, each window by the steps that its rollout
+   took: so these are the derivatives of what was simulated. Where a sensitivity would be unstable
+   at a state that rests, steps are halved. */
 static void follow(vd *x, vd (*S)[COLUMNS], const vd *u, const vd *du, const vd *s, int nc,
-                   const int *place, int late, vd h, int halved)
+                   const int *place, int late, vd h, const unsigned *steps)
 {
     vd k1[NX], k2[NX], k3[NX], k4[NX], y[NX];
     vd s1[NX][COLUMNS], s2[NX][COLUMNS], s3[NX][COLUMNS], s4[NX][COLUMNS], T[NX][COLUMNS];
+    int done[WIDTH] = {0};
 #define STAGE(K, SK, FACTOR, KN, SN)                                                              \
     for (int i = 0; i < NX; i++) {                                                                \
         y[i] = x[i] + (FACTOR) * K[i];                                                            \
         for (int c = 0; c < nc; c++) T[i][c] = S[i][c] + (FACTOR) * SK[i][c];                     \
     }                                                                                             \
     variational(y, T, u, du, s, nc, place, late, KN, SN);
-    for (int done = 0; done < WHOLE;) {
-        const vd part = h / (double)(1 << halved);
+    for (int going = 1; going;) {
+        vd part;
         const vd decay = variational(x, S, u, du, s, nc, place, late, k1, s1);
-        if (halved < HALVINGS && most(part * decay) > STABLE) {
-            halved++;
-            continue;
+        going = 0;
+        for (int l = 0; l < WIDTH; l++) {
+            /* Windows that have arrived wait with steps of no length. */
+            int length = done[l] < WHOLE ? length_of(steps[l], done[l]) : 0;
+            while (length > 1 && h[l] * length / WHOLE * decay[l] > STABLE) length /= 2;
+            part[l] = h[l] * length / WHOLE;
+            done[l] += length;
+            going |= done[l] < WHOLE;
         }
         STAGE(k1, s1, part / 2.0, k2, s2)
         STAGE(k2, s2, part / 2.0, k3, s3)
@@ -61,7 +70,6 @@ static void follow(vd *x, vd (*S)[COLUMNS], const vd *u, const vd *du, const vd 
             for (int c = 0; c < nc; c++)
                 S[i][c] += part / 6.0 * (s1[i][c] + 2.0 * s2[i][c] + 2.0 * s3[i][c] + s4[i][c]);
         }
-        done += WHOLE >> halved;
     }
 }
 
@@ -120,8 +128,8 @@ static void late_output(int j, int k, double delay, int delay_to, const Row *his
 /* Normal equations of windows of one record, each by its own columns.
 
    Window l has the rows first[l] .. first[l] + length[l] of time (n), u and du (n, NU), the states
-   X (n, NX), the halvings of their steps halved (n), the residuals R and the weights W (n, NY; 0
-   where no sample is). Its rows from[l] .. until[l]-1 count, and it reports its sensitivities at
+   X (n, NX), their steps (n, most; rollout.c), the residuals R and the weights W (n, NY; 0 where no
+   sample is). Its rows from[l] .. until[l]-1 count, and it reports its sensitivities at
    its row handed[l].
 
    H (WIDTH, nc, nc) and g (WIDTH, nc) are sums of J'WWJ and J'WWR, S (WIDTH, NX, nc) what is
@@ -130,7 +138,7 @@ static void late_output(int j, int k, double delay, int delay_to, const Row *his
 int cgw_normal(const int *first, const int *length, const int *from, const int *until,
                const int *handed, const double *time, double largest, const double *u, const double *du,
                const double *p, int nc, const int *place, int late, const double *X,
-               const int *halved, const double *R, const double *W, const double *delay,
+               int most, const int *steps, const double *R, const double *W, const double *delay,
                const int *delay_to, double *H, double *g, double *S_handed, double *Jacobian)
 {
     vd x[NX], S[NX][COLUMNS], J[NY][COLUMNS], C[NY][NX], parameters[NP], s[SHARED + 1], held[NU],
@@ -149,12 +157,12 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
     }
     for (int k = 0; k < rows; k++) {
         vd dt = {0};
-        int longest = 0;
+        double longest = 0;
         for (int l = 0; l < WIDTH; l++) {
             const int row = first[l] + (k < length[l] ? k : length[l] - 1);
             if (k + 1 < length[l]) {
                 dt[l] = time[row + 1] - time[row];
-                longest = halved[row] > longest ? halved[row] : longest;
+                longest = dt[l] > longest ? dt[l] : longest;
             }
             for (int v = 0; v < NU; v++) held[v][l] = u[row * NU + v], slope[v][l] = du[row * NU + v];
             if (k == handed[l])
@@ -187,9 +195,18 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                 for (int c = a; c < nc; c++) HH[a][c] += wa * J[j][c];
             }
         }
-        const int m = steps_of(most(dt), largest);
-        for (int i = 0; i < m && k + 1 < rows; i++)
-            follow(x, S, held, slope, s, nc, place, late, dt / (double)m, longest);
+        /* Rows of windows whose stamps are not regular may be cut into different intervals. */
+        const int cut = steps_of(longest, largest);
+        for (int i = 0; i < cut && k + 1 < rows; i++) {
+            vd part = {0};
+            unsigned taken[WIDTH];
+            for (int l = 0; l < WIDTH; l++) {
+                const int own = steps_of(dt[l], largest);
+                part[l] = i < own ? dt[l] / own : 0;
+                taken[l] = k + 1 < length[l] && i < own ? steps[(first[l] + k) * most + i] : 1;
+            }
+            follow(x, S, held, slope, s, nc, place, late, part, taken);
+        }
     }
     for (int l = 0; l < WIDTH; l++)
         for (int a = 0; a < nc; a++) {
