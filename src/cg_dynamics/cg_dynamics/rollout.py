@@ -1,7 +1,8 @@
 """Rollouts of one model in machine code: rollout.c for its states, windows.c for sensitivities.
 
 A rollout is simulated once, step by step. Its sensitivities obey linear equations along it, so
-that eight windows of it are integrated side by side in the lanes of one register and chained, by the very steps that the rollout took:
+that eight windows of it are integrated side by side in the lanes of one register, by the very
+steps that the rollout took, and chained:
 
     S(t) = Phi_w(t) S(t_w) + Gamma_w(t)      for t in window w, which begins at t_w
 
