@@ -11,6 +11,7 @@ from rich.table import Table
 
 from cg_sysid import bags, parallel
 from cg_sysid.check import use_anyway_option
+from cg_sysid.deadline import OutOfTime
 from cg_sysid.report.wording import event_words, left_words, undetermined_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
@@ -34,6 +35,10 @@ def run(program: str, work: Callable[[argparse.Namespace], int], options) -> int
     except (ValueError, OSError) as error:
         print(f'{program}: error: {one_line(error)}', file=sys.stderr)
         return BAD_INPUT
+    except OutOfTime as early:
+        print(f'{program}: {early} before the model was fitted once: there is no answer yet; give '
+              'it more time', file=sys.stderr)  # fmt: skip
+        return INTERRUPTED
     except KeyboardInterrupt:
         parallel.stop()
         print(f'{program}: interrupted', file=sys.stderr)

@@ -17,6 +17,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
+from cg_sysid.deadline import check_time
 from cg_sysid.landings import NUDGES, OWN, Passage, simulate_passage
 
 # Effect -> what it changes of the law.
@@ -283,6 +284,7 @@ class _Fitter:
             return theta, states, True
         damping = 1e-4
         for _ in range(ITERATIONS):
+            check_time()
             H, g, solved = self.reduced(theta, states, damping)
             damped = H + damping * np.diag(np.diag(H))
             step = np.clip(-np.linalg.lstsq(damped, g, rcond=1e-12)[0], -LONGEST, LONGEST)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from cg_dynamics.contact import contact_law
+from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
@@ -26,7 +27,6 @@ from cg_sysid.by_recording import what_wanders
 from cg_sysid.candidates import (
     SAME,
     THOROUGH_ITERATIONS,
-    Look,
     Outcome,
     Task,
     candidates_for,
@@ -40,6 +40,7 @@ from cg_sysid.candidates import (
     strained,
 )
 from cg_sysid.characterise import what_remains
+from cg_sysid.deadline import Deadline, OutOfTime
 from cg_sysid.diagnosis import (
     Candidate,
     Cause,
@@ -68,15 +69,18 @@ from cg_sysid.jury import (
     settled,
     share_explained,
 )
+from cg_sysid.kept_fits import keeping, kept_in
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.late_samples import late_samples
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.race import RUNGS, Effects, Race
 from cg_sysid.record import Record
-from cg_sysid.text import measured, off_by
+from cg_sysid.so_far import SoFar, Unfinished, title_of
+from cg_sysid.text import measured
 from cg_sysid.trial import Trial, prepare
 from cg_sysid.unknowns import IdentificationError
+from cg_sysid.unmodelled import Unmodelled
 from cg_sysid.wandering import Wandering
 
 log = logging.getLogger(__name__)
@@ -94,7 +98,6 @@ FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowher
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
 SMALL_FAULTS = 'small faults'
-NOTHING_YET = 2  # no fit (0) and no first look (1)
 Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
 
@@ -158,6 +161,7 @@ def diagnose(
     progress: Progress | None = None,
     executor: Executor | None = None,
     landings: Sequence[Landing] | None = None,
+    deadline: Deadline | None = None,
 ) -> Diagnosis:
     """Say what a model gets wrong about records of its machine.
 
@@ -169,11 +173,14 @@ def diagnose(
         executor: Where candidates are fitted; by default local processes.
         landings: What lies between records that are phases of walking ones (phases.cut_steps); by
             default the records are cut here.
+        deadline: When to answer with the best so far (Diagnosis.unfinished); by default never.
 
     Raises:
         IdentificationError: if the records cannot be used with this model.
+        OutOfTime: if the deadline passed before the nominal model was fitted.
     """
     options, progress = options or Options(), progress or (lambda *_: None)
+    deadline = deadline or Deadline()
     if landings is None:
         cut = cut_steps(records, model)
         records, landings = cut.records, cut.landings
@@ -181,27 +188,45 @@ def diagnose(
     train, held = split(trials, options.held)
 
     def answer(train: Sequence[Trial], held: Sequence[Trial]) -> Diagnosis:
-        search = _Search(model, train, held, options, progress, executor)
-        return with_landings(search.run(), landings, search.carry_out, options.effects)
+        search = _Search(model, train, held, options, progress, executor, deadline)
+        found = search.run()
+        try:
+            return with_landings(found, landings, search.carry_out, options.effects)
+        except OutOfTime:
+            return broken_off(found, deadline, 'the landings')
 
-    found = answer(train, held)
-    if found.landings is None or 'foot_slip' not in found.landings.accepted:
-        return found
-    # Knowing the friction one knows better where the foot was held, and what that says.
-    sides = [
-        held_by_friction(
-            found.extended.model, side, fit.motions, contact_law(found.extended.model).friction,
-            float(np.median([landing.touchdown.slope for landing in landings])),
-        )
-        for side, fit in ((train, found.extended.train), (held, found.extended.held))
-    ]  # fmt: skip
-    same = all(len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
-               for a, b in zip(sides, (train, held), strict=True))  # fmt: skip
-    if same or not all(sides):
-        return found
-    again = answer(*sides)
-    better = again.landings is not None and again.landings.after.sum() < found.landings.after.sum()
-    return again if better else found
+    with deadline.kept(), kept_in(options.kept):
+        found = answer(train, held)
+        if found.landings is None or 'foot_slip' not in found.landings.accepted:
+            return found
+        # Knowing the friction one knows better where the foot was held, and what that says.
+        friction = contact_law(found.extended.model).friction
+        slope = float(np.median([landing.touchdown.slope for landing in landings]))
+        sides = [
+            held_by_friction(found.extended.model, side, fit.motions, friction, slope)
+            for side, fit in ((train, found.extended.train), (held, found.extended.held))
+        ]
+        same = all(len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
+                   for a, b in zip(sides, (train, held), strict=True))  # fmt: skip
+        if same or not all(sides):
+            return found
+        known_friction = 'the search again, with the friction of the ground known'
+        try:
+            again = answer(*sides)
+        except OutOfTime:
+            return broken_off(found, deadline, known_friction)
+        if again.unfinished is not None:
+            return broken_off(found, deadline, known_friction)
+    before, after = found.landings, again.landings
+    return again if after is not None and after.after.sum() < before.after.sum() else found
+
+
+def broken_off(found: Diagnosis, deadline: Deadline, step: str) -> Diagnosis:
+    """The diagnosis, marked as one that the deadline kept from one more step."""
+    before = found.unfinished or Unfinished(deadline.why, deadline.passed, (), (), (), ())
+    marked = replace(before, steps=(*before.steps, step))
+    summary = found.summary.removesuffix(f' {before.text}')
+    return replace(found, unfinished=marked, summary=f'{summary} {marked.text}')
 
 
 def led_in(trial: Trial) -> Trial:
@@ -232,24 +257,35 @@ def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> str:
 class _Search:
     """State of one diagnosis: what was tried on top of what."""
 
-    def __init__(self, model, train, held, options, progress, executor):
+    def __init__(self, model, train, held, options, progress, executor, deadline):
+        self.deadline = deadline
         self.nominal, self.options, self.progress = model, options, progress
         self.train, self.held, self.executor = train, held, executor
         self.jury = Jury(train, held)
         self.race = Race(train, held, self.carry_out)
+        self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         # By the labels of what was added, and whether small faults are allowed for.
         self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | str] = {}  # to all records
+        # For an answer before the end: what stands, and the base of the contest under way.
+        self.found: Outcome
+        self.under_way: Outcome
         self.rounds: list[Round] = []
         self.instead = ''  # of a small fault, if something else explains as much
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
-        self.leading = (NOTHING_YET, np.inf, '')  # the best fit, or look, for the progress
 
     def run(self) -> Diagnosis:
         base = self.race.fit([Task(self.nominal)], 'fitting the nominal model')[0]
         if isinstance(base, str):
             raise IdentificationError(base)
+        self.found = self.under_way = base
+        try:
+            return self._search(base)
+        except OutOfTime:
+            return self._broken_off(base)
+
+    def _search(self, base: Outcome) -> Diagnosis:
         final = self._extend(base)
         seen = {self._added(final)}
         for _ in range(REVIEWS):
@@ -273,6 +309,7 @@ class _Search:
 
     def _extend(self, o: Outcome) -> Outcome:
         """Accept one effect after the other, until nothing more is earned."""
+        self.found = o
         while len(self._added(o)) < self.options.rounds:
             plain, o = o, self._with_small_faults(o)
             winner = None
@@ -281,7 +318,8 @@ class _Search:
                 o, winner = contest.base, contest.winner()
                 self._note(contest, winner[0].label if winner else '')
             if winner is not None:
-                o = self._refitted(winner[1])
+                self.found = winner[1]
+                o = self.found = self._refitted(winner[1])
                 continue
             if plain is o and o.task.bounds and not settled(o):
                 # They came in before the causes did, and another cause could do without them.
@@ -536,7 +574,9 @@ class _Search:
                 imperfect(base.model, bounds),
             )  # fmt: skip
             title = f'effects on top of {self._title(added)}'
+            self.under_way = base
             base, alone = self._led_deeper(base, effects, title)
+            self.under_way = base
             outcomes, aside = ([], []) if self._done(base) else self.race.run(
                 alone, effects, title, beaten
             )
@@ -572,27 +612,21 @@ class _Search:
         return replace(task, first=first_seconds(task, self.train))
 
     def carry_out(self, function: Callable, arguments: list[tuple], what: str) -> list:
+        # Other machines have no such folder.
+        kept = self.options.kept if self.executor is None else None
         return run_all(
-            function, arguments, self.options.workers, self.executor,
+            keeping, [(kept, function, *a) for a in arguments], self.options.workers,
+            self.executor,
             lambda done, total, result: self.progress(what, done, total, self._best(result)),
         )  # fmt: skip
 
     def _best(self, result: Any) -> str:
-        """The best candidate after one more result, in words: a fit, before any a first look."""
-        if isinstance(result, Outcome):
-            error, label = result.train.normalised_error, self._title(self._added(result))
-            self.leading = min(self.leading, (0, error, label))
-        elif isinstance(result, Look) and result.error > 0:
-            title = self._title(self._added_to(result.task.model) | {result.label})
-            self.leading = min(self.leading, (1, result.error, title))
-        kind, error, label = self.leading
-        if kind == NOTHING_YET:
-            return ''
-        where = ' in the first seconds' if kind else ''
-        return f'{label}, {off_by(error)}{where}'
+        """The best candidate after one more result, in words."""
+        self.so_far.note(result)
+        return self.so_far.best
 
     def _title(self, added: frozenset[str]) -> str:
-        return ' + '.join(['nominal', *sorted(added)])
+        return title_of(added)
 
     def _note(self, contest: Contest, accepted: str) -> None:
         candidates = tuple(c for c, _ in contest.ranked)
@@ -712,17 +746,72 @@ class _Search:
             wandering = None  # the same for all records, and more
         share = share_explained(nominal.held, final.held)
         verdict = verdict_of(causes, bool(left), share)
-        gains = gains_of(self.nominal, self.held, nominal.held, final.held)
+        late = self._late_samples(self._gains(nominal, final)) if verdict == 'unexplained' else ''
+        return self._answer(nominal, final, causes, verdict, unmodelled, wandering, late)
+
+    def _broken_off(self, nominal: Outcome) -> Diagnosis:
+        """The best answer before the end, without any fit more."""
+        final, contest = self.found, None
+        if self._added(self.under_way) >= self._added(final):
+            final = self.under_way
+            contest = self.jury.contest(final, self.so_far.fitted(final.task))
+            winner = None if self._done(final) else contest.winner()
+            self._note(contest, winner[0].label if winner else '')
+            final = winner[1] if winner else final
+        contests = [*self.contests.values(), *([contest] if contest else [])]
+        causes = [_cause_among(final, label, contests) for label in sorted(self._added(final))]
+        left = bool(self._left(final))
+        verdict = verdict_of(causes, left, share_explained(nominal.held, final.held))
+        verdict = 'unfinished' if verdict == 'unexplained' else verdict
+        return self._answer(
+            nominal, final, sorted(causes, key=lambda cause: -cause.evidence), verdict,
+            unfinished=self._unfinished(final, left),
+        )  # fmt: skip
+
+    def _unfinished(self, final: Outcome, left: bool) -> Unfinished:
+        """What was not come to."""
+        base = self.under_way.task
+        fitted = {o.label for o in self.so_far.fitted(base)}
+        looked = {look.label for look in self.so_far.looked_at(base)} - fitted
+        recorded = {name for trial in self.train for name in trial.input_names}
+        possible = candidates_for(base.model, self._setups(), self.options.effects, recorded,
+                                  imperfect(base.model, base.bounds))  # fmt: skip
+        labels = {LIBRARY[name](base.model.mechanism, at).label for name, at in possible}
+        ruled_out = {label for r in self.rounds for label in r.aside}
+        ranking = [s for s in self.so_far.ranking(base) if s.label not in self._added(final)]
+        steps = ['further causes'] if left else []
+        if self._added(final):
+            steps += ['doubt about each cause beside the others', 'thorough fits of the answer']
+        return Unfinished(
+            self.deadline.why, self.deadline.passed, tuple(ranking),
+            tuple(sorted(looked - ruled_out)),
+            tuple(sorted(labels - looked - fitted - self._added(final))), tuple(steps),
+        )  # fmt: skip
+
+    def _gains(self, nominal: Outcome, final: Outcome) -> tuple[Gain, ...]:
+        return gains_of(self.nominal, self.held, nominal.held, final.held)
+
+    def _answer(
+        self,
+        nominal: Outcome,
+        final: Outcome,
+        causes: Sequence[Cause],
+        verdict: str,
+        unmodelled: Unmodelled | None = None,
+        wandering: Wandering | None = None,
+        late: str = '',
+        unfinished: Unfinished | None = None,
+    ) -> Diagnosis:
+        gains = self._gains(nominal, final)
         reference = self.jury.judge(nominal, nominal, 0.0)
-        late = self._late_samples(gains) if verdict == 'unexplained' else ''
         extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
+        summary = summary_of(
+            verdict, causes, gains, self._left(final), tuple(strained(nominal)), unmodelled,
+            self.options.effects, wandering, share_explained(nominal.held, final.held), late,
+        )  # fmt: skip
         return Diagnosis(
             verdict=verdict,
-            summary=summary_of(
-                verdict, causes, gains, left, tuple(strained(nominal)), unmodelled,
-                self.options.effects, wandering, share,
-                late,
-            ),
+            summary=f'{summary} {unfinished.text}' if unfinished else summary,
             causes=tuple(causes),
             gains=gains,
             nominal=self.nominal,
@@ -739,6 +828,7 @@ class _Search:
             unmodelled=unmodelled,
             wandering=wandering,
             late=late,
+            unfinished=unfinished,
         )  # fmt: skip
 
 
@@ -830,6 +920,15 @@ def _as_in(final: Outcome, cause: Cause) -> Cause:
             if name.startswith(prefix)
         ),
     )  # fmt: skip
+
+
+def _cause_among(final: Outcome, label: str, contests: Sequence[Contest]) -> Cause:
+    """The cause, judged by the contest that had the most beside it."""
+    known = [c for c in contests if (own := c.of(label)) and not own[0].reason]
+    if not known:
+        return _as_in(final, Cause(label, parameters_of(final, label), float('inf')))
+    contest = max(known, key=lambda c: len(c.base.model.effects))
+    return _as_in(final, _cause(final, label, contest))
 
 
 def _cause(final: Outcome, label: str, contest: Contest) -> Cause:

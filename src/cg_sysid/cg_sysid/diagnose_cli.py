@@ -5,10 +5,15 @@
 Writes DIR/diagnosis.json, DIR/report.html, DIR/curves.npz and, where records could be used,
 DIR/model.yaml: the model with the causes in it. What no cause explains is in DIR/learned.yaml: the
 same model with a learned term.
+
+An answer comes within the budget. Until the search is done, DIR/fits holds where its fits came to:
+the same command with more time goes on from there.
 """
 
 import argparse
 import fnmatch
+import math
+import shutil
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -22,6 +27,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid import cli, curves
 from cg_sysid.cluster import Cluster
+from cg_sysid.deadline import Deadline
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Diagnosis, Options
 from cg_sysid.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
@@ -35,9 +41,11 @@ from cg_sysid.report import write_report
 
 MODEL = 'model.yaml'
 LEARNED = 'learned.yaml'
+FITS = 'fits'
+BUDGET = 120.0  # s
 COLOURS = {
     'consistent': 'green', 'explained': 'green', 'ambiguous': 'yellow', 'unexplained': 'magenta',
-    'unusable': 'red',
+    'unfinished': 'magenta', 'unusable': 'red',
 }  # fmt: skip
 EPILOG = """\
 verdicts:
@@ -45,7 +53,11 @@ verdicts:
   explained     named causes are missing from the model
   ambiguous     causes that these recordings cannot tell apart
   unexplained   something is missing that no effect of the library explains
+  unfinished    the search was broken off before it found what explains most of the error
   unusable      the recordings themselves are broken (exit code 1)
+
+Ctrl-C ends the search with the best answer so far, as the end of the budget does. The same
+command with a larger --budget goes on from there.
 
 exit code 0 with an answer, 1 if the recordings are unusable, 2 for a wrong argument
 """
@@ -67,6 +79,11 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--rounds', type=int, default=Options.rounds, help='most effects to add [%(default)s]'
     )
+    made.add_argument(
+        '--budget', type=float, default=BUDGET, metavar='SECONDS',
+        help='end the search after this time with the best answer so far; inf for no limit '
+        '[%(default)g]',
+    )  # fmt: skip
     made.add_argument('--workers', type=int, help='local processes [one per core]')
     made.add_argument(
         '--scheduler', metavar='ADDRESS',
@@ -89,6 +106,11 @@ def work(options: argparse.Namespace) -> int:
     """Read, check, diagnose, write."""
     if options.rounds < 1:
         raise ValueError(f'--rounds is {options.rounds}; at least 1 is needed')
+    if not options.budget > 0:
+        raise ValueError(
+            f'--budget is {options.budget:g}; it must be positive (s), inf is allowed'
+        )
+    deadline = Deadline(options.budget)
     if options.workers is not None and options.workers < 0:
         raise ValueError(f'--workers is {options.workers}; it must not be negative')
     if options.scheduler is not None and options.workers is not None:
@@ -111,6 +133,7 @@ def work(options: argparse.Namespace) -> int:
             ['cg', 'diagnose', *_command(options)],
             {
                 'effects': options.effects or 'all', 'rounds': options.rounds,
+                'budget_s': options.budget if math.isfinite(options.budget) else None,
                 'window_s': options.window, 'held': options.held or 'automatic',
                 'input': options.torque or 'automatic', 'note': options.note,
             },
@@ -120,10 +143,11 @@ def work(options: argparse.Namespace) -> int:
             facts, lines = unusable_facts(model, intake, _why(intake), origin), []
             answer = None
         else:
-            answer = diagnose(
-                model, intake.records, _options(options, effects, intake, model), bars, executor,
-                intake.landings,
-            )
+            with deadline.interruptible('cg diagnose'):
+                answer = diagnose(
+                    model, intake.records, _options(options, effects, intake, model), bars,
+                    executor, intake.landings, deadline,
+                )
             lines = diagnosis_curves(answer)
             facts = diagnosis_facts(answer, intake, origin, lines)
         options.out.mkdir(parents=True, exist_ok=True)
@@ -131,6 +155,8 @@ def work(options: argparse.Namespace) -> int:
         faults = [signal for source in intake.sources for signal in source.signals]
         write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
+    if answer is not None and answer.unfinished is None:
+        shutil.rmtree(options.out / FITS, ignore_errors=True)
     cli.print_left_out(facts)
     cli.print_steps(Console(), intake.steps, intake.phases)
     show(Console(), facts, options.out, options.quiet)
@@ -149,6 +175,8 @@ def _command(options: argparse.Namespace) -> list[str]:
         words += ['--use-anyway', finding]
     if options.rounds != Options.rounds:
         words += ['--rounds', str(options.rounds)]
+    if options.budget != BUDGET:
+        words += ['--budget', f'{options.budget:g}']
     return [*words, *options.bags]
 
 
@@ -209,7 +237,7 @@ def _options(
             )
     return Options(
         effects=effects, rounds=options.rounds, workers=options.workers, held=held,
-        experiments=tuple(experiments_for(model)),
+        experiments=tuple(experiments_for(model)), kept=options.out / FITS,
     )  # fmt: skip
 
 
@@ -275,12 +303,19 @@ def extended_model(answer: Diagnosis, facts: Facts) -> Model:
 def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
     """Print the answer for people."""
     verdict = facts['verdict']
-    console.print(f'[bold {COLOURS[verdict]}]{verdict}[/]  {facts["summary"]}', highlight=False)
+    so_far = ' so far' if facts['unfinished'] and verdict != 'unfinished' else ''
+    console.print(
+        f'[bold {COLOURS[verdict]}]{verdict}{so_far}[/]  {facts["summary"]}', highlight=False
+    )
     if not quiet:
         cli.print_causes(console, facts)
         cli.print_gain(console, facts)
         cli.print_leftover(console, facts)
         cli.print_findings(console, facts['findings'])
+    if facts['unfinished']:
+        console.print(
+            '  [yellow]note[/] the same command with a larger --budget goes on from here'
+        )
     console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
 
 

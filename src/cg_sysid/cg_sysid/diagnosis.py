@@ -6,6 +6,7 @@ to disk in diagnosis_file.py.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
+from cg_sysid.so_far import Unfinished
 from cg_sysid.text import listed
 from cg_sysid.trial import Trial
 from cg_sysid.unmodelled import NOTHING, Unmodelled
@@ -124,7 +126,8 @@ class Diagnosis:
     """The answer.
 
     Attributes:
-        verdict: consistent, explained, ambiguous, unexplained or unusable.
+        verdict: consistent, explained, ambiguous, unexplained, unusable, or unfinished where the
+            search was broken off before it found what explains most of the error.
         summary: One sentence for people.
         causes: Named causes, strongest first; those of `unexplained` leave most of the error.
         gains: Simulation error before and after on held-out records.
@@ -161,6 +164,7 @@ class Diagnosis:
     landings: Landings | None = None
     wandering: Wandering | None = None
     late: str = ''
+    unfinished: Unfinished | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +177,8 @@ class Options:
         workers: Local processes.
         held: Names of the records to hold out; by default every second one of each set-up.
         experiments: What can be launched next, where these records do not decide.
+        kept: Folder where fits of local processes are kept, so that a search that was broken off
+            goes on from them; None keeps none.
     """
 
     effects: tuple[str, ...] | None = None
@@ -180,6 +186,7 @@ class Options:
     workers: int | None = None
     held: tuple[str, ...] | None = None
     experiments: tuple[Experiment, ...] = ()
+    kept: Path | None = None
 
 
 def effect_name(label: str) -> str:
@@ -261,6 +268,13 @@ def summary_of(
             )
         return f'{text} {late}' if late else text
     named = ', '.join(described(c) for c in causes)
+    if verdict == 'unfinished':
+        text = (
+            f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
+            f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '
+            'found so far.'
+        )
+        return f'{text} {named} takes {100 * explained:.0f} % of it.' if causes else text
     if biggest.before < NO_GAIN * biggest.after and strained:
         text = (
             f'The simulation lacks {named}: without it the model follows the records only with '

@@ -33,7 +33,9 @@ from cg_sysid.unmodelled import term_words, variable_words
 DIAGNOSIS = 'cg_diagnosis/1'
 IDENTIFICATION = 'cg_identification/1'
 FILE_NAMES = {DIAGNOSIS: 'diagnosis.json', IDENTIFICATION: 'identification.json'}
-VERDICTS = ('consistent', 'explained', 'ambiguous', 'unexplained', 'unusable', 'identified')
+VERDICTS = (
+    'consistent', 'explained', 'ambiguous', 'unexplained', 'unfinished', 'unusable', 'identified',
+)  # fmt: skip
 INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 
 Facts = dict[str, Any]
@@ -83,6 +85,7 @@ def diagnosis_facts(
         'wandering': _wandering(diagnosis),
         'late_samples': diagnosis.late,
         'landings': _landings(diagnosis),
+        'unfinished': _unfinished(diagnosis),
         'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
         **_fitted(diagnosis.nominal, fit),
         'findings': list(diagnosis.findings),
@@ -111,6 +114,7 @@ def unusable_facts(
         'wandering': None,
         'late_samples': '',
         'landings': None,
+        'unfinished': None,
         'ranking': [],
         'parameters': [
             _parameter(model, name, None) for name in model.declarations
@@ -181,6 +185,7 @@ def identification_facts(
         'wandering': None,
         'late_samples': '',
         'landings': None,
+        'unfinished': None,
         'ranking': [],
         **_fitted(model, fit),
         'findings': list(fit.warnings),
@@ -254,6 +259,24 @@ def _cause(cause: Cause, model: Model) -> Facts:
             record: _values(values, cause.label, ranges)
             for record, values in cause.events.items()
         },
+    }
+
+
+def _unfinished(diagnosis: Diagnosis) -> Facts | None:
+    found = diagnosis.unfinished
+    if found is None:
+        return None
+    return {
+        'why': found.why,
+        'seconds': found.seconds,
+        'text': found.text,
+        'ranking': [
+            {**_effect(s.label), 'in_noise': s.in_noise, 'whole_records': s.whole}
+            for s in found.ranking
+        ],
+        'not_fitted': list(found.not_fitted),
+        'not_tried': list(found.not_tried),
+        'not_done': list(found.steps),
     }
 
 

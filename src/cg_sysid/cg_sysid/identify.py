@@ -15,12 +15,15 @@ parameters far outside what the model file believes.
 import time as clock
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
+from cg_sysid import kept_fits
+from cg_sysid.deadline import check_time
 from cg_sysid.evidence import weight_of
 from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, moved, own_values, reduced
 from cg_sysid.text import off_by
@@ -64,6 +67,46 @@ def _so_far(found: _Descent) -> str:
     if found.point is None:
         return ''
     return off_by(float(found.point.sse.sum() / max(found.point.count.sum(), 1)))
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a fit came to, before anybody asks how sure that is; as numbers it can be kept.
+
+    Attributes:
+        theta: Coordinates of the unknowns, shape (k,).
+        motions: What each trial has of its own.
+        cost: Final cost.
+        sse: Squared error over noise variance of each trial and output, shape (trials, ny).
+        count: Samples behind it.
+        weight: Of the residual in the cost.
+        converged: Whether it is a minimum.
+    """
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    cost: float
+    sse: np.ndarray
+    count: np.ndarray
+    weight: float
+    converged: bool
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it as lists."""
+        return {
+            'theta': self.theta.tolist(), 'motions': [m.tolist() for m in self.motions],
+            'cost': self.cost, 'sse': self.sse.tolist(), 'count': self.count.tolist(),
+            'weight': self.weight, 'converged': self.converged,
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, numbers: Mapping[str, Any]) -> '_End':
+        """What `numbers` wrote."""
+        return cls(
+            np.array(numbers['theta'], float), [np.array(m, float) for m in numbers['motions']],
+            numbers['cost'], np.array(numbers['sse']), np.array(numbers['count']),
+            numbers['weight'], numbers['converged'],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -210,7 +253,64 @@ def fit(
     motions = list(problem.guesses if start is None else start.motions)
     longest = min(max(trial.duration for trial in trials), horizon)
     weight = 1.0 if start is None else 1 / start.inflation
-    stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+    place = kept_fits.place_of(
+        model, trials, names=[u.name for u in unknowns], theta=theta, motions=motions,
+        guesses=problem.guesses, longest=longest, weight=weight, reweight=reweight,
+        behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
+        thorough=thorough, reach=reach,
+    )  # fmt: skip
+    known = kept_fits.recall(place)
+    if known is not None:
+        end = _End.of(known)
+    else:
+        stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+        end = _descend(
+            problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
+            reach, progress,
+        )  # fmt: skip
+        kept_fits.keep(place, end.numbers())
+    values = problem.values(end.theta)
+    covariance, information, own_sigmas = uncertainty(
+        problem, end.theta, end.motions, longest, end.weight
+    )
+    values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
+    fitted = _with_uncertainty(model, unknowns, values, covariance)
+    result = Fit(
+        model=fitted,
+        unknowns=unknowns,
+        values=values,
+        covariance=covariance,
+        information=information,
+        motions=tuple(end.motions),
+        own=problem.own,
+        own_sigmas=own_sigmas,
+        cost=end.cost,
+        mse=end.sse / np.maximum(end.count, 1),
+        count=end.count,
+        inflation=1 / end.weight,
+        horizon=longest,
+        evaluations=problem.evaluations,
+        seconds=clock.perf_counter() - began,
+        refinement=refinement,
+        converged=end.converged,
+    )
+    return replace(result, warnings=tuple(_warnings(result, bounds or ())))
+
+
+def _descend(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizons: Sequence[float],
+    weight: float,
+    iterations: int,
+    reweight: bool,
+    thorough: bool,
+    reach: float,
+    progress: Progress,
+) -> _End:
+    """From a start to the minimum: over short horizons, then the last in rounds of weights."""
+    *stages, longest = horizons
     found = _Descent(theta, motions, None, False)
     at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
     rounds = max(1, iterations // max(1, at_once))
@@ -234,9 +334,9 @@ def fit(
         )  # fmt: skip
         if found.point is None:
             raise IdentificationError(
-                f'model {model.name!r} runs away along the data '
-                f'({", ".join(t.name for t in trials)}); its values are too far off, or the '
-                'records are too long for an unstable motion: cut them into windows'
+                f'model {problem.model.name!r} runs away along the data '
+                f'({", ".join(t.name for t in problem.trials)}); its values are too far off, or '
+                'the records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(problem, found.point) if reweight else 1.0
         # A minimum under weights that are about to change is none yet.
@@ -244,32 +344,12 @@ def fit(
         if converged or found.hopeless:
             break
         weight = new
-    theta, motions, point = found.theta, found.motions, found.point
+    point = found.point
     assert point is not None
-    values = problem.values(theta)
-    covariance, information, own_sigmas = uncertainty(problem, theta, motions, longest, weight)
-    values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
-    fitted = _with_uncertainty(model, unknowns, values, covariance)
-    result = Fit(
-        model=fitted,
-        unknowns=unknowns,
-        values=values,
-        covariance=covariance,
-        information=information,
-        motions=tuple(motions),
-        own=problem.own,
-        own_sigmas=own_sigmas,
-        cost=point.cost,
-        mse=point.sse / np.maximum(point.count, 1),
-        count=point.count,
-        inflation=1 / weight,
-        horizon=longest,
-        evaluations=problem.evaluations,
-        seconds=clock.perf_counter() - began,
-        refinement=refinement,
-        converged=converged,
-    )
-    return replace(result, warnings=tuple(_warnings(result, bounds or ())))
+    return _End(
+        found.theta, found.motions, float(point.cost), point.sse, point.count, float(weight),
+        converged,
+    )  # fmt: skip
 
 
 def _guesses(
@@ -323,6 +403,7 @@ def _minimise(
         return reached, there_own, there.beside(BARRIER, barrier) if there is not None else None
 
     for _ in range(iterations):
+        check_time()
         errors.append(point.sse.sum() / point.count.sum())
         if _out_of_reach(errors, reach):
             return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)

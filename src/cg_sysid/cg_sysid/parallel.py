@@ -2,6 +2,8 @@
 
 Many pieces go to processes. One alone stays in this process and has all cores for itself: what it
 does record by record goes to threads, as compiled simulations run beside Python.
+
+Where the thread that waits keeps a deadline (deadline.py), it waits no longer than that.
 """
 
 import multiprocessing
@@ -11,10 +13,21 @@ import signal
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextvars import ContextVar
 from typing import Any
+
+from cg_sysid.deadline import OutOfTime, check_time, current
+
+POLL_S = 0.2  # between looks at a deadline
 
 _pool: ProcessPoolExecutor | None = None
 _knows_script = False  # whether the processes of the pool have run the script
@@ -37,7 +50,11 @@ def run_all(
         executor: Use this instead.
         progress: Called with (done, total, result of the piece that was finished last), first with
             (0, total, None).
+
+    Raises:
+        OutOfTime: if a deadline passed; what is under way elsewhere is dropped.
     """
+    check_time()
     total = len(arguments)
     if total:
         progress(0, total, None)
@@ -45,6 +62,7 @@ def run_all(
     if executor is None and cores < 2:
         results = []
         for done, a in enumerate(arguments, start=1):
+            check_time()
             results.append(function(*a))
             progress(done, total, results[-1])
         return results
@@ -52,11 +70,30 @@ def run_all(
         results = [_with_threads(cores, function, *arguments[0])]
         progress(1, 1, results[0])
         return results
-    executor = executor or _local(workers, function.__module__ == '__main__')
-    futures = [executor.submit(function, *a) for a in arguments]
-    for done, future in enumerate(as_completed(futures), start=1):
-        progress(done, total, future.result())
+    pool = executor or _local(workers, function.__module__ == '__main__')
+    futures = [pool.submit(function, *a) for a in arguments]
+    try:
+        for done, future in enumerate(_in_time(futures), start=1):
+            progress(done, total, future.result())
+    except OutOfTime:
+        for future in futures:
+            future.cancel()
+        if executor is None:
+            stop()  # what is under way does not look at our clock
+        raise
     return [future.result() for future in futures]
+
+
+def _in_time(futures: Sequence[Future]) -> Iterator[Future]:
+    """Futures as they are done, until the deadline of this thread."""
+    left = set(futures)
+    while left:
+        check_time()
+        deadline = current()
+        # A deadline may also be brought forward, by somebody who does not wake us.
+        patience = None if deadline is None else min(deadline.left, POLL_S)
+        done, left = wait(left, patience, FIRST_COMPLETED)
+        yield from done
 
 
 def side_by_side(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterable[Any]:

@@ -18,6 +18,7 @@ from cg_sysid.report.wording import (
 from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
 
 WORTH_NATS = 6.0  # that an experiment must promise to be worth its while
+MOST_STANDINGS = 8  # candidates of a search that was broken off that are listed
 PLACES = {
     'command': '; it acts on the way of the command',
     'transmission': '; it acts in the transmission',
@@ -34,6 +35,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
     """The answer in words, the causes and the gain."""
     verdict = facts['verdict']
     left = [
+        _unfinished(facts),
         *[_cause(cause) for cause in facts['causes']],
         unmodelled(facts),
         _wandering(facts),
@@ -56,6 +58,27 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
         tag('div', tag('div', left) if left else None, tag('div', right) if right else None,
             class_='columns' if both else 'columns one'),
         class_=f'hero {verdict}', id='answer',
+    )  # fmt: skip
+
+
+def _unfinished(facts: Facts) -> Markup | None:
+    found = facts.get('unfinished')
+    if found is None:
+        return None
+    rows = [
+        tag('tr', tag('td', effect_name(one['label'])), tag('td', number(one['in_noise'])),
+            tag('td', 'whole records' if one['whole_records'] else 'first seconds'))
+        for one in found['ranking'][:MOST_STANDINGS]
+    ]  # fmt: skip
+    table = tag('table',
+        tag('tr', tag('th', 'candidate'), tag('th', 'error left, in noise'), tag('th', 'in')),
+        rows,
+    )  # fmt: skip
+    return tag('div',
+        tag('h3', 'The best answer so far'),
+        tag('p', found['text']),
+        table if rows else None,
+        class_='card', id='unfinished',
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ VERDICTS = {
     'explained': 'Named causes account for the error.',
     'ambiguous': 'Several causes explain these recordings equally well.',
     'unexplained': 'Something is missing that no known effect explains.',
+    'unfinished': 'The search was broken off before it found what explains the error.',
     'unusable': 'The recordings themselves are broken.',
     'identified': 'Parameters of the model as given, fitted to the recordings.',
 }
@@ -56,6 +57,8 @@ def headline(facts: Facts) -> str:
         worst = worst_channel(facts)
         at = f' in {worst}' if worst else ''
         return f'There is an error{at} that {_nothing_tried(facts)} explains'
+    if verdict == 'unfinished':
+        return 'No cause of most of the error was found so far'
     if verdict == 'unusable':
         bad, total = len(facts['unusable']), len(facts['sources'])
         if bad == total:
