@@ -177,9 +177,10 @@ def test_the_command_line_fits_on_the_cluster_and_can_be_interrupted(
         until(lambda: working(client))
         program.send_signal(signal.SIGINT)
         out, err = program.communicate(timeout=LONG)
-        # Before it there may be lines of progress.
-        assert (program.returncode, out) == (130, '')
-        assert err.splitlines()[-1] == 'cg diagnose: interrupted'
+        # Before any fit there is nothing to answer with, and after one the best so far.
+        assert 'cg diagnose: the best answer so far follows' in err
+        assert 'interrupted after' in (out or err).replace('\n', ' ')
+        assert program.returncode == (0 if out else 130)
         until(lambda: not tasks(client))
         until(lambda: not working(client))
 
