@@ -106,8 +106,9 @@ def _rehearsed(
             for truth, doubted in ((accepted, other), (other, accepted)):
                 models = dict(rivals)
                 trial = imagined(models[truth].model, sigma, experiment, excitation)
-                nats = _lost(models[doubted], trial) * experiment.duration / trial.duration
-                worth.append((nats, (accepted, other)))
+                # Noise alone costs some models some hundred nats, and the true one as many.
+                nats = _lost(models[doubted], trial) - _lost(models[truth], trial)
+                worth.append((nats * experiment.duration / trial.duration, (accepted, other)))
     except (IdentificationError, DynamicsError, ValueError, np.linalg.LinAlgError):
         return None
     nats, weakest = min(worth)

@@ -577,6 +577,18 @@ def too_small(o: Outcome) -> list[str]:
     return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
 
 
+def undetermined_size(o: Outcome) -> list[str]:
+    """An effect of whose size not even the order is known is not what helped.
+
+    A limit that was never reached, a stiffness that nothing bends: what acts is something else.
+    """
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    if kind is None or f'{o.label}.{kind.parameters[0].name}' not in o.train.undetermined:
+        return []
+    name = kind.parameters[0].name
+    return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
+
+
 def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
     """Standard deviation of a value, were the values of these names known."""
     names = [u.name for u in found.unknowns]

@@ -56,7 +56,12 @@ from cg_sysid.diagnosis import (
 )
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.identify import Fit
-from cg_sysid.imperfections import faults_among, imperfect, with_imperfections
+from cg_sysid.imperfections import (
+    as_sound_robots,
+    faults_among,
+    imperfect,
+    with_imperfections,
+)
 from cg_sysid.jury import (
     COARSE_FIDELITY,
     EARNED,
@@ -427,7 +432,7 @@ class _Search:
 
     def _with_small_faults(self, o: Outcome) -> Outcome:
         """The same with what every robot has a little of, if that explains anything."""
-        if at_noise(o) or o.task.bounds:
+        if settled(o) or o.task.bounds:
             return o
         model, bounds = with_imperfections(o.model, self._setups())
         title = f'{self._title(self._added(o))}, with small faults'
@@ -435,6 +440,8 @@ class _Search:
         if isinstance(found, str):
             log.info('small faults: %s', found)
             return o
+        if at_noise(o):
+            return found if settled(found) else o  # only beliefs are at stake
         # Beside a large cause they would explain a little of it; then they can wait.
         return found if chi2(found) < MOST_OF_IT * chi2(o) else o
 
@@ -449,9 +456,10 @@ class _Search:
         plain, winner = contest.base, contest.winner()
         if winner is None:
             return plain if settled(plain) else None
-        equals = [winner[0], *contest.close_to(winner[0].label)]
-        if any(_is_small(candidate, faulty) for candidate in equals):
-            return None
+        least = winner[0].evidence - contest.margin
+        if any(as_sound_robots(c.label, c.parameters)
+               for c, _ in contest.ranked if c.evidence > least):  # fmt: skip
+            return None  # it may be no more than that
         both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
         label = winner[0].label
@@ -849,14 +857,6 @@ def _shown(o: Outcome) -> tuple[str, ...]:
     """Small faults that are there."""
     small = sorted(imperfect(o.model, o.task.bounds))
     return tuple(label for label in small if _shows(o, label))
-
-
-def _is_small(candidate: Candidate, faulty: Outcome) -> bool:
-    """True if what is tried as a cause is one of the small faults, and as small."""
-    return any(
-        abs(value) <= faulty.task.bounds.get(f'{candidate.label}.{name}', -np.inf)
-        for name, (value, *_) in candidate.parameters.items()
-    )
 
 
 def _shows(o: Outcome, label: str) -> bool:

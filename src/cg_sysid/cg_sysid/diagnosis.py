@@ -17,7 +17,7 @@ from cg_sysid.experiments import Experiment
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
 from cg_sysid.so_far import Unfinished
-from cg_sysid.text import listed
+from cg_sysid.text import listed, measured, number
 from cg_sysid.trial import Trial
 from cg_sysid.unmodelled import NOTHING, Unmodelled
 from cg_sysid.wandering import Wandering
@@ -298,6 +298,11 @@ def summary_of(
             f' To tell {" from ".join(best.weakest)}, run {best.experiment} '
             f'(about {best.evidence:.0f} nats expected).'
         )
+    elif best is not None:
+        text += (
+            f' No experiment that can be launched would tell {" from ".join(best.weakest)}: for '
+            'what these recordings show they are one.'
+        )
     if left:
         text += f' An error above the noise remains in {", ".join(left)}.'
         text += f' {unmodelled.text}' if unmodelled else ''
@@ -307,21 +312,19 @@ def summary_of(
 
 def described(cause: Cause) -> str:
     """A cause with its numbers and rivals, in words."""
-    numbers = ', '.join(
-        f'{name} {_told(cause, name)}' + ('' if unit == '1' else f' {unit}')
-        for name, (_, _, unit) in cause.parameters.items()
-    )
+    numbers = ', '.join(f'{name} {_told(cause, name)}' for name in cause.parameters)
     rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
     return f'{cause.label} ({numbers}){rivals}'
 
 
 def _told(cause: Cause, name: str) -> str:
     """The value of a parameter, or what it ranges over where records have their own."""
+    value, sigma, unit = cause.parameters[name]
     own = {row[name][0] for row in cause.events.values() if name in row}
     if len(own) > 1:
-        return f'from {min(own):.3g} to {max(own):.3g}'
-    value, sigma, _ = cause.parameters[name]
-    return f'= {value:.3g} +- {sigma:.1g}' if sigma else f'= {value:g}'
+        tail = '' if unit == '1' else f' {unit}'
+        return f'from {number(min(own))} to {number(max(own))}{tail}'
+    return f'= {measured(value, sigma, unit)}'
 
 
 def per_output(fit: Fit) -> np.ndarray:

@@ -15,6 +15,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.coulomb_friction import TRANSITION_RATE
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid.text import measured
 
 # Effect -> parameter and its largest size in a sound robot, in the unit of the parameter.
 SOUND = {
@@ -23,6 +24,8 @@ SOUND = {
     'imu_offset': ('offset', 2e-3),
     'spring_stiffness': ('error', 0.015),
 }
+# Other names of the same fault: in what is recorded, a late reading is a late torque.
+ALSO = {'sensor_delay': 'actuator_delay'}
 NEXT_TO_NOTHING = 1e-3  # of the largest size: at its neutral value an effect takes no part
 
 Bounds = Mapping[str, float]
@@ -51,6 +54,24 @@ def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bo
                 model = model.with_effect(name, site, **{parameter: NEXT_TO_NOTHING * largest})
                 bounds[f'{label}.{parameter}'] = largest
     return model, bounds
+
+
+def as_sound_robots(label: str, sizes: Mapping[str, tuple[float, float, str]]) -> list[str]:
+    """Why an effect is no larger than sound robots have it; nothing if it is.
+
+    Args:
+        label: Of the effect.
+        sizes: Its parameters: name -> (value, standard deviation, unit).
+    """
+    name = label.partition('@')[0]
+    parameter, largest = SOUND.get(ALSO.get(name, name), ('', 0.0))
+    if parameter not in sizes or abs(sizes[parameter][0]) > largest:
+        return []
+    value, sigma, unit = sizes[parameter]
+    return [
+        f'{parameter} = {measured(value, sigma, unit)} is no more than sound robots have '
+        f'({measured(largest, None, unit)})'
+    ]
 
 
 def turning(model: Model, name: str, at: str | None) -> dict[str, float]:

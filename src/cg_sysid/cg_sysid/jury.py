@@ -16,11 +16,12 @@ from cg_sysid.candidates import (
     shared_unknowns,
     strained,
     too_small,
+    undetermined_size,
 )
 from cg_sysid.diagnosis import MARGIN, Candidate, contains, per_output
 from cg_sysid.evidence import block_gain, evidence, independent_samples
 from cg_sysid.identify import Fit
-from cg_sysid.imperfections import faults_among
+from cg_sysid.imperfections import as_sound_robots, faults_among
 from cg_sysid.trial import Trial
 
 # Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
@@ -178,20 +179,22 @@ class Jury:
         ):
             reasons.append(f'explains {explained:.2f} noise standard deviations, '
                            f'{MATERIAL:g} needed')
-        own = _own_values(o) / len(self.steps)
+        each = _own_values(o) / len(self.steps)
         eventful = any(u.each == 'record' for u in o.train.own)
-        if eventful and independent < SAYS_MORE * own * len(self.steps):
+        if eventful and independent < SAYS_MORE * each * len(self.steps):
             # With a push of its own a short record is matched whatever is wrong, held out or not.
             reasons.append(
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
-                f'judge {own:.0f} values of each record\'s own'
+                f'judge {each:.0f} values of each record\'s own'
             )
         left = above_noise(o) / max(above_noise(base), 1e-300)
         if eventful and not at_noise(o) and left > MISHAP:
             # A push in every record takes the edge off whatever is wrong all the time.
             reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
                            f'{100 * MISHAP:.0f} % allowed')
-        reasons += at_edge(o) + too_small(o)
+        own = own_parameters(o)
+        reasons += at_edge(o) + too_small(o) + undetermined_size(o)
+        reasons += as_sound_robots(o.label, own)
         return Candidate(
             label=o.label,
             model=o.train.model,
@@ -201,7 +204,7 @@ class Jury:
             held_gain=float(held_gain),
             significance=significance,
             explained=explained,
-            parameters=own_parameters(o),
+            parameters=own,
             reason='; '.join(reasons),
         )
 

@@ -47,6 +47,29 @@ def test_the_proposed_experiment_settles_what_is_ambiguous(model_file):
     second = diagnose(nominal, records, options)
     assert second.verdict == 'explained'
     assert [c.label for c in second.causes] == ['ankle_friction']
+    # The rival loses at least what was promised for one record, whichever of the two was true.
+    nats = {c.label: c.evidence for c in second.rounds[0].candidates}
+    assert nats['ankle_friction'] - nats['spring_damping'] > best.evidence
+
+
+def test_causes_that_are_one_get_no_advice(model_file):
+    """Late torques and late readings: no torque that can be launched tells them apart."""
+    nominal = Model.load(model_file)
+    machine = nominal.with_values({'c1': 1.1 * nominal.values['c1']})
+    machine = machine.with_effect('actuator_delay', delay=0.008)
+    records = [
+        _record(machine, name, seed, 5.0)
+        for seed, name in enumerate(2 * ('spring_stabilised_inner', 'swing_inner_fixed'))
+    ]
+    options = Options(effects=('actuator_delay', 'sensor_delay'), workers=1,
+                      experiments=tuple(experiments_for(nominal)))  # fmt: skip
+    found = diagnose(nominal, records, options)
+    assert found.verdict == 'ambiguous'
+    (cause,) = found.causes
+    assert {cause.label, *cause.rivals} == {'actuator_delay', 'sensor_delay'}
+    # Both are fitted to the same noise: what is left is how deep the fits went.
+    assert all(abs(p.evidence) < 0.1 * MARGIN for p in cause.proposals)
+    assert 'No experiment that can be launched would tell' in found.summary
 
 
 def test_imagined_record_is_what_the_machine_would_record(model_file):

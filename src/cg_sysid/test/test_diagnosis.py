@@ -19,8 +19,8 @@ def test_a_ratio_is_printed_without_a_unit_and_a_torque_with_its_own():
         Cause('torque_bias', {'torque': (0.8, 0.01, 'N m')}, 50.0),
     ]
     text = summary_of('explained', causes, (gain,), {})
-    assert 'imu_scale (scale = 1.02 +- 0.001)' in text
-    assert 'torque_bias (torque = 0.8 +- 0.01 N m)' in text
+    assert 'imu_scale (scale = 1.0216 \u00b1 0.0010)' in text
+    assert 'torque_bias (torque = 0.800 \u00b1 0.010 N m)' in text
 
 
 @pytest.mark.parametrize(

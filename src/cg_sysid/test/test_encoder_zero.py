@@ -111,7 +111,7 @@ def _diagnosed(nominal, machine, zeros):
 def test_zeros_of_their_own_are_named(nominal, machine):
     found = _diagnosed(nominal, machine, ZEROS)
     assert [(cause.label, cause.rivals) for cause in found.causes] == [('encoder_zero', ())]
-    assert re.search(r'encoder_zero \(zero from -0.01.* to 0.01.* rad\)', found.summary)
+    assert re.search(r'encoder_zero \(zero from −0.01.* to 0.01.* rad\)', found.summary)
     events = found.causes[0].events
     for k, zero in enumerate(ZEROS):
         value, sigma, unit = events[f'recording_{k}']['zero']

@@ -6,8 +6,10 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.candidates import Task, try_candidate
 from cg_sysid.diagnosis import Cause, Gain, summary_of
 from cg_sysid.identify import fit
+from cg_sysid.jury import Jury
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 
@@ -51,3 +53,24 @@ def test_the_summary_says_so():
     assert 'do not determine joint_flexibility.stiffness' in summary_of(
         'explained', [cause], (gain,), {}
     )
+
+
+def test_a_size_that_is_not_determined_is_no_cause(nominal):
+    """A motor that gives 1 N m and another loss: a limit explains nothing, whatever it gains."""
+    machine = nominal.with_effect('quadratic_friction', coefficient=0.05)
+    trials = prepare(nominal, [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
+            [lambda t, k=k: math.sin(2 * math.pi * (0.5 + 0.1 * k + 0.4 * t) * t)], 6.0, 0.004, k,
+        )
+        for k in range(2)
+    ])  # fmt: skip
+    train, held = trials[:1], trials[1:]
+    base, limited = (
+        try_candidate(Task(nominal, effect), train, held)
+        for effect in (None, ('torque_saturation', None))
+    )
+    judged = Jury(train, held).judge(base, limited, gained=1e3)
+    assert 'is not determined' in judged.reason
+    quadratic = try_candidate(Task(nominal, ('quadratic_friction', None)), train, held)
+    assert 'determined' not in Jury(train, held).judge(base, quadratic, gained=1e3).reason
