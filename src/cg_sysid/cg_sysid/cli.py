@@ -12,8 +12,8 @@ from rich.table import Table
 from cg_sysid import bags, parallel
 from cg_sysid.check import use_anyway_option
 from cg_sysid.deadline import OutOfTime
-from cg_sysid.report.wording import event_words, left_words, undetermined_words
-from cg_sysid.text import effect_name, measured, number, plain_unit
+from cg_sysid.report.wording import event_words, left_words, undetermined_words, value_words
+from cg_sysid.text import effect_name, number, plain_unit
 
 BAD_INPUT = 2
 UNUSABLE = 1
@@ -113,7 +113,7 @@ def print_causes(console: Console, facts: Facts) -> None:
     """The named causes with their numbers."""
     for cause in facts['causes']:
         numbers = ', '.join(
-            f'{name} = {measured(p["value"], p["sigma"], p["unit"])}'
+            f'{name} = {value_words(p)}'
             for name, p in cause['parameters'].items()
         )
         strength = cause['evidence_nats']

@@ -24,6 +24,7 @@ from cg_sysid.wandering import Wandering
 
 MOST_ROUNDS = 4
 NO_GAIN = 1.1  # times the error after, below which the error before is the same
+INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
 
 
@@ -320,11 +321,32 @@ def described(cause: Cause) -> str:
 def _told(cause: Cause, name: str) -> str:
     """The value of a parameter, or what it ranges over where records have their own."""
     value, sigma, unit = cause.parameters[name]
+    if not is_determined(cause.label, name, sigma):
+        return 'not determined'
     own = {row[name][0] for row in cause.events.values() if name in row}
     if len(own) > 1:
         tail = '' if unit == '1' else f' {unit}'
         return f'from {number(min(own))} to {number(max(own))}{tail}'
     return f'= {measured(value, sigma, unit)}'
+
+
+def is_determined(label: str, name: str, sigma: float) -> bool:
+    """Whether the 95 % interval of a place on a body tells where it is.
+
+    It does if it is no wider than what lies between two of the places from which it is sought.
+
+    Args:
+        label: Of the effect.
+        name: Of its parameter; all that are no places, sizes among them, count as determined.
+        sigma: Standard deviation in its unit.
+    """
+    kind = LIBRARY.get(effect_name(label))
+    declared = {p.name: p for p in kind.parameters}.get(name) if kind else None
+    if declared is None or declared.neutral is not None or declared.logarithmic:
+        return True
+    if declared.unit != 'm' or len(declared.starts) < 2:
+        return True
+    return 2 * INTERVAL * sigma <= float(np.diff(sorted(declared.starts)).min())
 
 
 def per_output(fit: Fit) -> np.ndarray:

@@ -20,7 +20,16 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.model import Model
 from cg_sysid.curves import Curve
-from cg_sysid.diagnosis import Candidate, Cause, Diagnosis, Gain, Round, gains_of
+from cg_sysid.diagnosis import (
+    INTERVAL,
+    Candidate,
+    Cause,
+    Diagnosis,
+    Gain,
+    Round,
+    gains_of,
+    is_determined,
+)
 from cg_sysid.findings import Finding
 from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
@@ -36,7 +45,6 @@ FILE_NAMES = {DIAGNOSIS: 'diagnosis.json', IDENTIFICATION: 'identification.json'
 VERDICTS = (
     'consistent', 'explained', 'ambiguous', 'unexplained', 'unfinished', 'unusable', 'identified',
 )  # fmt: skip
-INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 
 Facts = dict[str, Any]
 
@@ -307,7 +315,9 @@ def _unmodelled(diagnosis: Diagnosis) -> Facts | None:
     return {
         'label': found.label,
         'text': found.text,
-        'what': term_words(found.effect),
+        'what': found.what,
+        'constant': shape.constant,
+        'mean': shape.mean,
         'where': found.where,
         'at': found.effect.site,
         'follows': found.effect.follows,
@@ -426,6 +436,7 @@ def _values(parameters: Mapping[str, tuple[float, float, str]], label: str, rang
             'sigma': sigma,
             'unit': unit,
             'interval95': interval(value, sigma, bool(declared and declared.logarithmic)),
+            'determined': is_determined(label, name, sigma),
             'description': declared.description if declared else '',
         }
     return found

@@ -20,6 +20,7 @@ SURE = 2.0  # standard deviations from which a value of the function counts
 PURE = 0.9  # share of its power from which a function is called even or odd
 SYMMETRIC = 0.3  # least share of the range on the other side of zero to judge that
 MOST = 0.9  # of the power of a function that lies in one stretch
+VARIES = 0.25  # of its mean: a function that varies less is a constant
 SHORT = 0.4  # share of the range up to which such a stretch is worth saying
 
 
@@ -33,6 +34,7 @@ class Shape:
         sigma: Standard deviation of each value, shape (n,).
         seen: Where there are samples enough, shape (n,).
         covered: Lowest and highest value of the variable.
+        mean: Mean of g over all samples.
         rms: Root mean square of g over all samples.
         peak: Largest magnitude on the grid, where it is seen and sure.
         even: Share of the power that is even about zero, 0 to 1; None where zero is not amid the
@@ -45,10 +47,16 @@ class Shape:
     sigma: np.ndarray = field(repr=False)
     seen: np.ndarray = field(repr=False)
     covered: tuple[float, float]
+    mean: float
     rms: float
     peak: float
     even: float | None
     stretch: tuple[float, float] | None
+
+    @property
+    def constant(self) -> bool:
+        """Whether it hardly varies over the samples."""
+        return self.rms**2 - self.mean**2 < (VARIES * self.mean) ** 2
 
     @property
     def parity(self) -> str:
@@ -84,6 +92,7 @@ def shape_of(effect: LearnedEffect, fit: Fit, variable: np.ndarray) -> Shape:
         sigma=sigma,
         seen=seen,
         covered=(low, high),
+        mean=float(np.mean(at_samples)),
         rms=float(np.sqrt(np.mean(at_samples**2))),
         peak=float(np.abs(sure).max()),
         even=None if effect.variable == 'time' else _even(s, value, seen),

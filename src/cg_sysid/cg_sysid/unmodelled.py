@@ -78,10 +78,19 @@ class Unmodelled:
         return where_of(self.effect)
 
     @property
+    def what(self) -> str:
+        """What acts where and what it follows, if it varies at all."""
+        if not self.shape.constant:
+            return term_words(self.effect)
+        size = _quantity(self.shape.mean, self.effect.unit)
+        return f'{_carried(self.effect)} that is constant, {size}'
+
+    @property
     def text(self) -> str:
         """One sentence for people, and one on rivals."""
+        features = '' if self.shape.constant else f': {", ".join(self._features())}'
         said = (
-            f'{sentence(term_words(self.effect))}: {", ".join(self._features())}. It explains '
+            f'{sentence(self.what)}{features}. It explains '
             f'{100 * self.explained:.3g} % of the error above the noise on records held out.'
         )
         if self.rivals:
@@ -128,15 +137,18 @@ def where_of(effect: LearnedEffect) -> str:
 
 def term_words(effect: LearnedEffect) -> str:
     """What acts where and what it follows: `a torque at the hip that follows the hip angle`."""
+    return f'{_carried(effect)} that follows {variable_words(effect)}'
+
+
+def _carried(effect: LearnedEffect) -> str:
+    """What acts where: `a torque at the hip`."""
     place = effect.site.partition(':')[0]
     if isinstance(effect, JointTerm):
-        what = BY_CARRIER[effect.carrier].format(place)
-    elif isinstance(effect, OuterTerm):
+        return BY_CARRIER[effect.carrier].format(place)
+    if isinstance(effect, OuterTerm):
         leg = 'the leg that stands' if place == 'stance' else f'the {place} legs'
-        what = f'a torque from outside on {leg}'
-    else:
-        what = f'an error of {place}'
-    return f'{what} that follows {variable_words(effect)}'
+        return f'a torque from outside on {leg}'
+    return f'an error of {place}'
 
 
 def variable_words(effect: LearnedEffect) -> str:

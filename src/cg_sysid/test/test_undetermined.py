@@ -1,9 +1,12 @@
 """What records do not tell is said, by the fit and in the summary."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.candidates import Task, try_candidate
@@ -11,7 +14,9 @@ from cg_sysid.diagnosis import Cause, Gain, summary_of
 from cg_sysid.identify import fit
 from cg_sysid.jury import Jury
 from cg_sysid.rehearse import rehearse
+from cg_sysid.shape import Shape
 from cg_sysid.trial import prepare
+from cg_sysid.unmodelled import Unmodelled
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFT = {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.6}
@@ -74,3 +79,35 @@ def test_a_size_that_is_not_determined_is_no_cause(nominal):
     assert 'is not determined' in judged.reason
     quadratic = try_candidate(Task(nominal, ('quadratic_friction', None)), train, held)
     assert 'determined' not in Jury(train, held).judge(base, quadratic, gained=1e3).reason
+
+
+@pytest.mark.parametrize(
+    ('sigma', 'told'),
+    [(0.2, 'distance not determined'), (0.05, 'distance = 0.170 \u00b1 0.050 m')],
+)
+def test_a_place_is_told_where_the_interval_tells_one(sigma, told):
+    """Payloads are sought 0.2, 0.6 and 1 m from the joint: +- 0.4 m holds two of these."""
+    cause = Cause(
+        'payload@outer', {'mass': (1.2, 0.1, 'kg'), 'distance': (0.17, sigma, 'm')}, 900.0
+    )
+    gain = Gain('hip_angle', 'rad', 1e-2, 2e-3, 0.001)
+    text = summary_of('explained', [cause], (gain,), {})
+    assert 'mass = 1.20 \u00b1 0.10 kg' in text
+    assert told in text
+    assert ('0.17' in text) == (sigma < 0.1)
+
+
+def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):
+    """A wave found on a torque of 0.21 N m that is always there is no wave."""
+    s = np.linspace(-0.08, 0.08, 5)
+    shape = Shape(s, np.full(5, 0.21), np.full(5, 0.01), np.ones(5, bool), (0.0, 6.0), mean=0.21,
+                  rms=0.2105, peak=0.22, even=None, stretch=None)  # fmt: skip
+    kind = UNMODELLED['unmodelled_joint_torque_periodic_in_time']
+    effect = kind(nominal.mechanism, kind.sites(nominal.mechanism)[0])
+    found = Unmodelled(effect, shape, (0.16, 1e-3), {}, 400.0, 9.0, 0.72, None, (), None, None)
+    assert found.text == (
+        'A torque at the hip that is constant, 0.21 N m. It explains 72 % of the error above the '
+        'noise on records held out.'
+    )
+    wave = replace(found, shape=replace(shape, mean=0.02))
+    assert 'that follows the time of the record: repeating every 0.16 s' in wave.text

@@ -200,7 +200,11 @@ def undetermined_words(cause: Facts) -> list[str]:
 
 def parameter_words(parameters: Facts) -> list[str]:
     """`delay 8.01 ± 0.05 ms`, one for each parameter."""
-    return [
-        f'{name.replace("_", " ")} {measured(p["value"], p["sigma"], p["unit"])}'
-        for name, p in parameters.items()
-    ]
+    return [f'{name.replace("_", " ")} {value_words(p)}' for name, p in parameters.items()]
+
+
+def value_words(parameter: Facts) -> str:
+    """`8.01 ± 0.05 ms`, or that the recordings do not determine it."""
+    if not parameter.get('determined', True):
+        return 'not determined'
+    return measured(parameter['value'], parameter['sigma'], parameter['unit'])
