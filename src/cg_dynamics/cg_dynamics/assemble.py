@@ -4,7 +4,7 @@ x = (s, ds/dt, z): free coordinates, their rates, extra states of the effects. T
 vector p is the mechanism's parameters, then those of each effect, then those of the springs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -127,21 +127,30 @@ def assemble(model: Model, setup: Setup) -> Equations:
         here = [e for e in effects if e.site == joint or e.site == 'all']
         joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
         angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
-        load = reported
+        load, share = reported, 0
         for hook in ('deliver', 'transmit', 'joint_torque'):
             added = 0
             for e in here:
                 if not overrides(e, hook):
                     continue
-                if e.states:
-                    starts[e.label] = e.initial_states(angle, rate, load, own[e.label])
                 zs, ps = z_of[e.label], own[e.label]
+                at_start = load
+                if hook == 'transmit' and (rotor := e.rotor(zs, ps)) is not None:
+                    a, w, on_rotor = rotor
+                    opposing = on_rotor * (1 - share) * friction(here, a, w, load, own)
+                    # A record begins with the rotor moving as the joint does.
+                    at_start += ca.substitute(opposing, ca.vertcat(a, w), ca.vertcat(angle, rate))
+                    load += opposing
+                    share += on_rotor * (1 - share)
+                if e.states:
+                    starts[e.label] = e.initial_states(angle, rate, at_start, own[e.label])
                 if hook == 'deliver':
                     load = pass_through(e, e.deliver(load, zs, ps))
                 elif hook == 'transmit':
                     load = pass_through(e, e.transmit(load, angle, rate, zs, ps))
                 else:
-                    added += pass_through(e, e.joint_torque(angle, rate, load, zs, ps))
+                    torque = pass_through(e, e.joint_torque(angle, rate, load, zs, ps))
+                    added += torque * (1 - share) if divides(e) else torque
             load = load + added
         torques.append(load)
 
@@ -214,6 +223,23 @@ def assemble(model: Model, setup: Setup) -> Equations:
         ),
         largest_step=min((e.largest_step for e in effects), default=float('inf')),
     )
+
+
+def divides(effect: Effect) -> bool:
+    """Whether a rotor takes its share of an effect: of friction; bristles stay at the joint."""
+    return bool(effect.friction) and not effect.states and overrides(effect, 'joint_torque')
+
+
+def friction(
+    effects: Sequence[Effect],
+    angle: ca.SX,
+    rate: ca.SX,
+    load: ca.SX,
+    own: Mapping[str, Mapping[str, ca.SX]],
+) -> ca.SX:
+    """Torque in N m of the friction without states, at an angle in rad and a rate in rad/s."""
+    shared = [e for e in effects if divides(e)]
+    return sum((e.joint_torque(angle, rate, load, [], own[e.label])[0] for e in shared), ca.SX(0))
 
 
 def overrides(effect: Effect, hook: str) -> bool:

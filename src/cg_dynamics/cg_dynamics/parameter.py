@@ -44,6 +44,8 @@ class Parameter:
             one.
         smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn
             it faster; a solver may start with a wider one.
+        bounded: True of a share, whose range ends where physics does: a value there is a finding
+            as any other.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Parameter:
     leeway: float = 0.0
     along: str = ''
     smoothing: bool = False
+    bounded: bool = False
 
     def sliding(self) -> 'Parameter':
         """This declaration for a joint that slides."""

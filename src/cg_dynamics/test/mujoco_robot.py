@@ -29,6 +29,7 @@ class Hidden:
         at_stance: A torque between stance leg and ground, (time, angle, rate) -> N m.
         on_leg: A torque on each leg from outside, its own rate -> N m.
         flexibility: (stiffness, rotor inertia, damping) between motor and hip, or None.
+        motor_share: Share of viscous and dry friction that acts on the rotor.
         gap: Total play of that in rad: within it nothing is transmitted.
         spring_damping: N s/m of each spring.
         torque_delay: Time in s by which the torque acts late.
@@ -48,6 +49,7 @@ class Hidden:
     at_stance: Callable[[float, float, float], float] | None = None
     on_leg: Callable[[float], float] | None = None
     flexibility: tuple[float, float, float] | None = None
+    motor_share: float = 0.0
     gap: float = 0.0
     spring_damping: float = 0.0
     torque_delay: float = 0.0
@@ -205,12 +207,11 @@ class _Robot:
         if self.joint['rotor'] is not None:
             rotor = self.joint['rotor']
             torque = self._through(data.qpos[rotor] - angle, data.qvel[rotor] - rate)
-            data.qfrc_passive[rotor] += self.torque - torque
+            opposing = hidden.motor_share * self._friction(data.qvel[rotor])
+            data.qfrc_passive[rotor] += self.torque + opposing - torque
         if hidden.at_hip is not None:
             torque += hidden.at_hip(data.time, angle, rate, torque)
-        torque -= hidden.viscous * rate
-        if hidden.coulomb:
-            torque -= hidden.coulomb * math.tanh(rate / hidden.transition_rate)
+        torque += (1 - hidden.motor_share) * self._friction(rate)
         data.qfrc_passive[hip] += self.sign * torque
         if hidden.on_leg is not None:
             turning = data.qvel[hip] + (0.0 if stance is None else data.qvel[stance])
@@ -224,6 +225,11 @@ class _Robot:
                 rate + (0.0 if hip is None else data.qvel[hip])
             )
         return torque
+
+    def _friction(self, rate) -> float:
+        hidden = self.hidden
+        dry = hidden.coulomb * math.tanh(rate / hidden.transition_rate)
+        return -hidden.viscous * rate - dry
 
     def _through(self, twist, twist_rate) -> float:
         stiffness, _, damping = self.hidden.flexibility

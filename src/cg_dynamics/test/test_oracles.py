@@ -120,6 +120,24 @@ def test_every_hidden_effect(engine, links, springs):
         compare_with_mujoco(engine, links, model, Setup(springs=springs), hidden)
 
 
+@pytest.mark.parametrize('share', [0.0, 0.6, 1.0])
+def test_friction_on_both_sides_of_a_flexible_drive(engine, links, springs, share):
+    model = (
+        links.with_effect('viscous_friction', coefficient=0.7)
+        .with_effect('coulomb_friction', torque=1.8)
+        .with_effect(
+            'joint_flexibility', stiffness=300.0, rotor_inertia=0.1, damping=0.5,
+            motor_share=share,
+        )
+    )  # fmt: skip
+    hidden = engine.Hidden(
+        viscous=0.7, coulomb=1.8, flexibility=(300.0, 0.1, 0.5), motor_share=share
+    )
+    # From rest: there the rotor starts wound up by nothing, here by the friction on it.
+    start = np.array([0.05, 0.1, 0.0, 0.0])
+    compare_with_mujoco(engine, links, model, Setup(springs=springs), hidden, start)
+
+
 # --- compass gait, pendulum and double pendulum in Drake ----------------------------------------
 
 

@@ -606,14 +606,16 @@ def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
 def at_edge(o: Outcome) -> list[str]:
     """A parameter at the edge of its range says that the effect is not what is meant.
 
-    But for a part of an effect that may well be absent: the edge is where it vanishes.
+    But for a part of an effect that may well be absent: the edge is where it vanishes; and for a
+    share, which may be none or all.
     """
     found = []
     kind = LIBRARY.get(o.label.partition('@')[0])
     optional = {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower
                 } if kind else set()
+    shares = {f'{o.label}.{p.name}' for p in kind.parameters if p.bounded} if kind else set()
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
-        if u.name in o.task.bounds or not u.name.startswith(f'{o.label}.'):
+        if u.name in {*o.task.bounds, *shares} or not u.name.startswith(f'{o.label}.'):
             continue
         low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
                          for x in (u.lower, u.upper, v))

@@ -531,8 +531,9 @@ def _warnings(fit: Fit, bounds: Collection[str]):
             continue  # the bound is a statement, not a finding
         unit = '' if u.unit == '1' else f' {u.unit}'
         span = u.upper - u.lower
-        absent = value == fit.model.declarations[u.name].neutral
-        if min(value - u.lower, u.upper - value) <= 1e-6 * span and not absent:
+        declared = fit.model.declarations[u.name]
+        meant = declared.bounded or value == declared.neutral
+        if min(value - u.lower, u.upper - value) <= 1e-6 * span and not meant:
             yield f'{u.name} = {value:.4g}{unit} lies at the edge of its range'
         if not np.isfinite(sigma):
             yield f'{u.name} cannot be identified from these records'

@@ -83,3 +83,29 @@ def test_the_wrong_one_alone_is_no_silent_explanation(hidden):
         assert 'An error above the noise remains' in found.summary
         assert all(channel in found.summary for channel in left)
     assert found.extended.held.normalised_error > 1.3
+
+
+@pytest.mark.parametrize('share', [pytest.param(0.6, marks=pytest.mark.evidence), 1.0])
+def test_friction_on_the_side_of_the_motor_is_found_there(model_file, share):
+    """Where harmonic drives have it: all of it on the rotor is a finding, not an edge."""
+    nominal = Model.load(model_file)
+    machine = nominal.with_values({'c4': 1.05 * nominal.values['c4']}).with_effect(
+        'joint_flexibility', **MACHINES['joint_flexibility'], motor_share=share
+    )
+    records = [
+        rehearse(
+            f'record_{k}', machine, Setup('inner', springs=springs('inner')),
+            [0.1 - 0.07 * k, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 9.0 * np.sin(2 * np.pi * (0.5 + 0.1 * k + 0.3 * t) * t)],
+            DURATION, SAMPLE, seed=60 + k,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    effects = ('joint_flexibility', 'actuator_lag', 'rotor_inertia', 'encoder_zero')
+    found = diagnose(nominal, records, Options(effects=effects, workers=1))
+    assert [(cause.label, cause.rivals) for cause in found.causes] == [('joint_flexibility', ())]
+    hidden = {**MACHINES['joint_flexibility'], 'motor_share': share}
+    for name, true in hidden.items():
+        value, sigma, _ = found.causes[0].parameters[name]
+        # Four standard deviations, and what integrators differ by.
+        assert abs(value - true) < 4 * sigma + 5e-3 * true

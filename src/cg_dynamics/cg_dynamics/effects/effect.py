@@ -195,6 +195,14 @@ class Effect:
         """
         return {}
 
+    def rotor(self, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, ca.SX, ca.SX] | None:
+        """Where friction acts before the transmission: a rotor's angle, rate and share of it.
+
+        The share is that of all friction without states at the same joint; the rest of it acts on
+        the joint. None where nothing turns apart from the joint.
+        """
+        return None
+
     def torque_limit(self, values: Mapping[str, float]) -> float:
         """Largest torque in N m that it lets through, given its own parameters."""
         return math.inf
