@@ -127,7 +127,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
         here = [e for e in effects if e.site == joint or e.site == 'all']
         joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
         angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
-        load, share = reported, 0
+        load, share = reported, ca.SX(0)
         for hook in ('deliver', 'transmit', 'joint_torque'):
             added = 0
             for e in here:

@@ -126,8 +126,7 @@ def test_friction_on_both_sides_of_a_flexible_drive(engine, links, springs, shar
         links.with_effect('viscous_friction', coefficient=0.7)
         .with_effect('coulomb_friction', torque=1.8)
         .with_effect(
-            'joint_flexibility', stiffness=300.0, rotor_inertia=0.1, damping=0.5,
-            motor_share=share,
+            'motor_side_friction', stiffness=300.0, rotor_inertia=0.1, damping=0.5, share=share
         )
     )  # fmt: skip
     hidden = engine.Hidden(

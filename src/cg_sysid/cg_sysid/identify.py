@@ -100,13 +100,18 @@ class _End:
         }  # fmt: skip
 
     @classmethod
-    def of(cls, numbers: Mapping[str, Any]) -> '_End':
-        """What `numbers` wrote."""
-        return cls(
-            np.array(numbers['theta'], float), [np.array(m, float) for m in numbers['motions']],
-            numbers['cost'], np.array(numbers['sse']), np.array(numbers['count']),
-            numbers['weight'], numbers['converged'],
-        )  # fmt: skip
+    def of(cls, numbers: Mapping[str, Any] | None) -> '_End | None':
+        """What `numbers` wrote; None of nothing, or of something else."""
+        try:
+            return None if numbers is None else cls(
+                np.array(numbers['theta'], float),
+                [np.array(m, float) for m in numbers['motions']],
+                float(numbers['cost']), np.array(numbers['sse'], float),
+                np.array(numbers['count'], float), float(numbers['weight']),
+                bool(numbers['converged']),
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError):
+            return None
 
 
 @dataclass(frozen=True)
@@ -259,10 +264,8 @@ def fit(
         behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
         thorough=thorough, reach=reach,
     )  # fmt: skip
-    known = kept_fits.recall(place)
-    if known is not None:
-        end = _End.of(known)
-    else:
+    end = _End.of(kept_fits.recall(place))
+    if end is None:
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
         end = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,

@@ -23,6 +23,7 @@ import cg_description
 import cg_dynamics
 import cg_sysid
 from cg_description.model_file import write_atomically
+from cg_description.reading import JSON, DocumentError, parse_json, read_text
 from cg_dynamics.cluster import source_hash
 from cg_dynamics.model import Model
 from cg_sysid.trial import Trial
@@ -71,8 +72,8 @@ def recall(place: Path | None) -> Mapping[str, Any] | None:
     if place is None:
         return None
     try:
-        end = json.loads(place.read_text())
-    except (OSError, ValueError):
+        end = parse_json(read_text(place, limits=JSON), str(place))
+    except DocumentError:
         return None
     return end if isinstance(end, dict) else None
 

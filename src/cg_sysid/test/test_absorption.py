@@ -90,7 +90,7 @@ def test_friction_on_the_side_of_the_motor_is_found_there(model_file, share):
     """Where harmonic drives have it: all of it on the rotor is a finding, not an edge."""
     nominal = Model.load(model_file)
     machine = nominal.with_values({'c4': 1.05 * nominal.values['c4']}).with_effect(
-        'joint_flexibility', **MACHINES['joint_flexibility'], motor_share=share
+        'motor_side_friction', **MACHINES['joint_flexibility'], share=share
     )
     records = [
         rehearse(
@@ -101,10 +101,10 @@ def test_friction_on_the_side_of_the_motor_is_found_there(model_file, share):
         )
         for k in range(2)
     ]  # fmt: skip
-    effects = ('joint_flexibility', 'actuator_lag', 'rotor_inertia', 'encoder_zero')
+    effects = ('joint_flexibility', 'motor_side_friction', 'actuator_lag', 'encoder_zero')
     found = diagnose(nominal, records, Options(effects=effects, workers=1))
-    assert [(cause.label, cause.rivals) for cause in found.causes] == [('joint_flexibility', ())]
-    hidden = {**MACHINES['joint_flexibility'], 'motor_share': share}
+    assert [(cause.label, cause.rivals) for cause in found.causes] == [('motor_side_friction', ())]
+    hidden = {**MACHINES['joint_flexibility'], 'share': share}
     for name, true in hidden.items():
         value, sigma, _ = found.causes[0].parameters[name]
         # Four standard deviations, and what integrators differ by.

@@ -176,11 +176,13 @@ def test_a_search_goes_on_from_what_is_kept(delayed, tmp_path, monkeypatch):
     assert first.unfinished is not None
     before = len(descents)
     assert 0 < before < needed
-    # A file that was damaged since is fitted again.
+    # Files that were damaged since are fitted again.
     some = sorted(kept.iterdir())[0]
     some.write_text(some.read_text()[:40])
+    other = sorted(kept.iterdir())[1]
+    other.write_text('{"theta": 1}')
     rest = diagnose(model, records, Options(effects=EFFECTS, workers=0, kept=kept))
-    assert len(descents) == needed + 1
+    assert len(descents) == needed + 2
     assert rest.verdict == at_once.verdict
     assert [cause.parameters for cause in rest.causes] == [
         cause.parameters for cause in at_once.causes
