@@ -4,7 +4,7 @@ import math
 
 from cg_sysid.report.function import unmodelled
 from cg_sysid.report.landings import landings
-from cg_sysid.report.markup import Markup, tag
+from cg_sysid.report.markup import Markup, column, row, tag
 from cg_sysid.report.wording import (
     VERDICTS,
     Facts,
@@ -51,13 +51,13 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
     if notes is not None:
         (right if left else left).append(notes)
     both = bool(left) and bool(right)
-    return tag('div',
+    return tag('section',
         tag('span', verdict, class_='verdict', title=VERDICTS[verdict]),
-        tag('h1', sentence(headline(facts))),
+        tag('h1', sentence(headline(facts)), id='answer-title'),
         tag('p', lead(facts), class_='lead'),
         tag('div', tag('div', left) if left else None, tag('div', right) if right else None,
             class_='columns' if both else 'columns one'),
-        class_=f'hero {verdict}', id='answer',
+        class_=f'hero {verdict}', id='answer', aria_labelledby='answer-title',
     )  # fmt: skip
 
 
@@ -66,16 +66,17 @@ def _unfinished(facts: Facts) -> Markup | None:
     if found is None:
         return None
     rows = [
-        tag('tr', tag('td', effect_name(one['label'])), tag('td', number(one['in_noise'])),
+        tag('tr', row(effect_name(one['label'])), tag('td', number(one['in_noise'])),
             tag('td', 'whole records' if one['whole_records'] else 'first seconds'))
         for one in found['ranking'][:MOST_STANDINGS]
     ]  # fmt: skip
     table = tag('table',
-        tag('tr', tag('th', 'candidate'), tag('th', 'error left, in noise'), tag('th', 'in')),
-        rows,
+        tag('thead',
+            tag('tr', column('candidate'), column('error left, in noise'), column('in'))),
+        tag('tbody', rows),
     )  # fmt: skip
     return tag('div',
-        tag('h3', 'The best answer so far'),
+        tag('h2', 'The best answer so far'),
         tag('p', found['text']),
         table if rows else None,
         class_='card', id='unfinished',
@@ -87,14 +88,16 @@ def _wandering(facts: Facts) -> Markup | None:
     if found is None:
         return None
     rows = [
-        tag('tr', tag('td', recording, class_='mono'),
+        tag('tr', row(recording, class_='mono'),
             tag('td', measured(own['value'], own['sigma'], found['unit'])))
         for recording, own in found['values'].items()
     ]  # fmt: skip
     return tag('div',
-        tag('h3', 'What differs between recordings'),
+        tag('h2', 'What differs between recordings'),
         tag('p', found['text']),
-        tag('table', tag('tr', tag('th', 'recording'), tag('th', found['name'])), rows),
+        tag('table',
+            tag('thead', tag('tr', column('recording'), column(found['name']))),
+            tag('tbody', rows)),
         class_='card', id='wandering',
     )  # fmt: skip
 
@@ -108,7 +111,7 @@ def _cause(cause: Facts) -> Markup:
         else 'Without it the model cannot follow the recordings at all'
     )
     return tag('div',
-        tag('h3', sentence(effect_name(cause['name'])), where),
+        tag('h2', sentence(effect_name(cause['name'])), where),
         [tag('p', words, class_='big') for words in parameter_words(cause['parameters'])],
         [tag('p', words, class_='soft') for words in event_words(cause)],
         [tag('p', f'{sentence(words)}.', class_='doubt') for words in undetermined_words(cause)],
@@ -153,7 +156,7 @@ def _faults(facts: Facts, drawn: Facts) -> Markup | None:
         errors = [f for f in source['findings'] if f['severity'] == 'error']
         if source['used']:
             continue
-        parts.append(tag('h3', source['name']))
+        parts.append(tag('h2', source['name']))
         for f in errors:
             where = ', '.join(w for w in (f['where'], f['place']) if w)
             parts.append(tag('div',
@@ -185,7 +188,7 @@ def _where(facts: Facts) -> Markup | None:
     if not words or facts['verdict'] == 'unusable':
         return None
     return tag('div',
-        tag('h3', 'Where an error is left'),
+        tag('h2', 'Where an error is left'),
         [tag('p', tag('b', channel), f': {text}.') for channel, text in words.items()],
         class_='card',
     )  # fmt: skip
@@ -195,7 +198,7 @@ def _left_out(facts: Facts) -> Markup | None:
     if facts['verdict'] == 'unusable' or not facts['unusable']:
         return None
     return tag('div',
-        tag('h3', 'Left out'),
+        tag('h2', 'Left out'),
         tag('p', 'These recordings are broken; the answer stands on the others.', class_='soft'),
         [tag('div', tag('b', u['name']), tag('p', u['reason']), class_='fault')
          for u in facts['unusable']],
@@ -207,7 +210,7 @@ def _overruled(facts: Facts) -> Markup | None:
     if not facts.get('overruled'):
         return None
     return tag('div',
-        tag('h3', 'Used anyway'),
+        tag('h2', 'Used anyway'),
         tag('p', 'The check refuses these recordings; they are used because it was overruled.',
             class_='soft'),
         [tag('div', tag('b', f'{entry["name"]}: {entry["code"]}'),
@@ -226,7 +229,7 @@ def _notes(facts: Facts) -> Markup | None:
     if len(notes) > 4 and facts['causes']:
         items = tag('details', tag('summary', f'{len(notes)} remarks on the fit'), items)
         return tag('div', items, class_='card')
-    return tag('div', tag('h3', 'Worth knowing'), items, class_='card')
+    return tag('div', tag('h2', 'Worth knowing'), items, class_='card')
 
 
 def gain(facts: Facts) -> Markup | None:
@@ -256,12 +259,12 @@ def gain(facts: Facts) -> Markup | None:
         before = 'before (identified anew)' if held else 'before (as given)'
         legend.insert(0, _key('before', before))
     return tag('div',
-        tag('h3', title),
+        tag('h2', title),
         tag('div', legend, class_='legend'),
         tag('div', cells,
             tag('div'), tag('div', [tag('span', f'{t:g}', style=f'left:{at(t)}') for t in ticks],
-                            class_='scale'), tag('div'),
-            tag('div', 'error / sensor noise', class_='axis'),
+                            class_='scale', aria_hidden='true'), tag('div'),
+            tag('div', 'error / sensor noise', class_='axis', aria_hidden='true'),
             class_='gain'),
         class_='card',
     )  # fmt: skip
@@ -296,7 +299,7 @@ def _dumbbell(g: Facts, at, ticks: list[float]) -> Markup:
             tag('i', class_='dot', style=f'left:{before}'),
         ]
     marks.append(tag('i', class_='dot to', style=f'left:{after}'))
-    return tag('div', marks, class_='track')
+    return tag('div', marks, class_='track', aria_hidden='true')  # its numbers stand beside it
 
 
 def _values(g: Facts) -> Markup:

@@ -1,6 +1,6 @@
 """Last part of the page: recordings, their quality, and where everything comes from."""
 
-from cg_sysid.report.markup import Markup, tag
+from cg_sysid.report.markup import Markup, column, row, tag, wide
 from cg_sysid.report.wording import Facts, input_units, setup_words
 from cg_sysid.text import effect_name, listed, number, plain_unit, scaled
 
@@ -12,12 +12,12 @@ def recordings(facts: Facts) -> Markup | None:
     if not facts['sources'] and not facts['records']:
         return None
     return tag('section',
-        tag('h2', 'Recordings'),
+        tag('h2', 'Recordings', id='data-title'),
         _records(facts),
         _noise(facts),
         tag('h3', 'What the check says', style='margin-top:22px') if facts['sources'] else None,
         [_source(s) for s in facts['sources']],
-        id='data',
+        id='data', aria_labelledby='data-title',
     )  # fmt: skip
 
 
@@ -25,13 +25,13 @@ def _records(facts: Facts) -> Markup | None:
     if not facts['records']:
         return None
     channels = [c for c in facts['channels'] if c['name'] in facts['gain']]
-    head = tag('tr', tag('th', 'record'), tag('th', 'use'), tag('th', 'length', class_='num'),
-               tag('th', 'rate', class_='num'),
-               [tag('th', 'error of ', c['name'], class_='num') for c in channels],
-               tag('th', 'covers'))  # fmt: skip
+    head = tag('tr', column('record'), column('use'), column('length', class_='num'),
+               column('rate', class_='num'),
+               [column('error of ', c['name'], class_='num') for c in channels],
+               column('covers'))  # fmt: skip
     rows = [
         tag('tr',
-            tag('td', tag('b', r['name']), tag('small', setup_words(r['setup']))),
+            row(tag('b', r['name']), tag('small', setup_words(r['setup']))),
             tag('td', ROLES[r['role']]),
             tag('td', f'{r["duration_s"]:.1f} s', class_='num'),
             tag('td', f'{number(r["rate_hz"])} Hz', class_='num'),
@@ -40,7 +40,7 @@ def _records(facts: Facts) -> Markup | None:
             tag('td', tag('small', _covers(facts, r))))
         for r in facts['records']
     ]  # fmt: skip
-    return tag('div', tag('table', tag('thead', head), tag('tbody', rows)), class_='scroll')
+    return wide('Records', tag('table', tag('thead', head), tag('tbody', rows)))
 
 
 def _error(error: Facts | None, unit: str) -> str:
@@ -105,7 +105,9 @@ def _findings(findings: list[Facts]) -> Markup | None:
         for f in findings
     ]  # fmt: skip
     columns = tag('colgroup', [tag('col', style=f'width:{w}%') for w in (9, 19, 16, 56)])
-    return tag('div', tag('table', columns, tag('tbody', rows)), class_='scroll')
+    head = tag('tr', column('severity'), column('where'), column('when', class_='num'),
+               column('finding'))  # fmt: skip
+    return wide('Findings', tag('table', columns, tag('thead', head), tag('tbody', rows)))
 
 
 def origin(facts: Facts) -> Markup:
@@ -130,9 +132,9 @@ def origin(facts: Facts) -> Markup:
     command = ' '.join(_quoted(word) for word in p.get('command') or ())
     pairs.append(('Command', tag('span', command, class_='mono')))
     return tag('section',
-        tag('h2', 'Provenance'),
+        tag('h2', 'Provenance', id='origin-title'),
         tag('dl', [[tag('dt', name), tag('dd', value)] for name, value in pairs]),
-        id='origin',
+        id='origin', aria_labelledby='origin-title',
     )  # fmt: skip
 
 

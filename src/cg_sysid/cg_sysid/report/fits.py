@@ -43,7 +43,7 @@ def viewer(facts: Facts, drawn: Facts) -> Markup | None:
     missing = len(facts['records']) - len(drawn['records'])
     note += f' {missing} more records are not shown.' if missing > 0 else ''
     return tag('section',
-        tag('h2', 'Measured and simulated'),
+        tag('h2', 'Measured and simulated', id='signals-title'),
         tag('p', 'Each simulation starts from its own fitted initial motion and then runs '
             f'free, driven by the recorded torque alone.{note}', class_='soft'),
         tag('div',
@@ -51,12 +51,14 @@ def viewer(facts: Facts, drawn: Facts) -> Markup | None:
                 tag('label', 'Record ', tag('select',
                     [tag('optgroup', options, label=words) for words, options in groups.items()],
                     aria_label='record')),
-                tag('div', class_='tabs group'),
+                tag('div', class_='tabs group', role='group', aria_label='output'),
                 tag('div',
                     [tag('button', t, type='button', data_span=s) for t, s in spans],
-                    tag('button', '\u2190', type='button', data_shift=-0.5, title='earlier'),
-                    tag('button', '\u2192', type='button', data_shift=0.5, title='later'),
-                    class_='group'),
+                    tag('button', '\u2190', type='button', data_shift=-0.5, title='earlier',
+                        aria_label='earlier'),
+                    tag('button', '\u2192', type='button', data_shift=0.5, title='later',
+                        aria_label='later'),
+                    class_='group', role='group', aria_label='span of time'),
                 tag('label', tag('input', type='checkbox'), ' residual on the scale of after')
                 if both else None,
                 class_='controls'),
@@ -65,7 +67,7 @@ def viewer(facts: Facts, drawn: Facts) -> Markup | None:
             tag('div', class_='torque'),
             tag('div', HINT, class_='readout', data_hint=HINT),
             id='viewer', data_channel=first, data_both=int(both)),
-        id='signals',
+        id='signals', aria_labelledby='signals-title',
     )  # fmt: skip
 
 
@@ -81,7 +83,7 @@ def residuals(facts: Facts, drawn: Facts) -> Markup | None:
     ]  # fmt: skip
     states = [
         tag('div',
-            tag('h3', channel),
+            tag('h4', channel),
             tag('div', [
                 tag('div', class_='against cell', data_channel=channel, data_index=k,
                     data_both=int(both))
@@ -91,7 +93,7 @@ def residuals(facts: Facts, drawn: Facts) -> Markup | None:
     ]  # fmt: skip
     which = 'held-out recordings' if facts['verdict'] != 'identified' else 'all recordings'
     return tag('section',
-        tag('h2', 'What is left'),
+        tag('h2', 'What is left', id='residuals-title'),
         tag('p', f'Simulated minus measured, over {which}. An error that the model could still '
             'explain shows as a hump in the spectrum or as a trend over angle, rate or torque; '
             'pure sensor noise is flat in all of them.', class_='soft'),
@@ -101,7 +103,7 @@ def residuals(facts: Facts, drawn: Facts) -> Markup | None:
         tag('h3', 'Residual against angle, rate and torque', style='margin-top:26px'),
         _legend(both, 'sensor noise (1 \u03c3); shading is the spread around the mean'),
         states,
-        id='residuals',
+        id='residuals', aria_labelledby='residuals-title',
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ def unmodelled(facts: Facts) -> Markup | None:
         for rival in term['rivals']
     ]
     return tag('div',
-        tag('h3', title),
+        tag('h2', title),
         tag('p', term['text']),
         picture(term),
         tag('p', 'Learned function (line), its 95 % band, where there are recordings (shaded)',

@@ -19,7 +19,7 @@ def landings(facts: Facts) -> Markup | None:
         return None
     cone = found['law']['friction'] is not None
     return tag('div',
-        tag('h3', f'{found["judged"]} landings'),
+        tag('h2', f'{found["judged"]} landings'),
         tag('p', found['text']),
         picture(found),
         tag('p', 'Impulse of the ground on each landing foot over its first 20 ms, measured by '

@@ -33,6 +33,26 @@ def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     return Markup(f'<{" ".join(words)}>{join(children)}</{name}>')
 
 
+def column(*children: object, **attributes: object) -> Markup:
+    """Header cell of a column."""
+    return tag('th', *children, scope='col', **attributes)
+
+
+def row(*children: object, **attributes: object) -> Markup:
+    """Header cell of a row: what it is about."""
+    return tag('th', *children, scope='row', **attributes)
+
+
+def wide(label: str, *children: object) -> Markup:
+    """What may be wider than the page: it scrolls by itself, by keyboard too.
+
+    Args:
+        label: What a screen reader calls it.
+        children: See `tag`.
+    """
+    return tag('div', *children, class_='scroll', tabindex=0, role='region', aria_label=label)
+
+
 def join(children: Iterable[object]) -> Markup:
     """Children as one piece of markup."""
     parts = []

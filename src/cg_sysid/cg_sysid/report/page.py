@@ -67,14 +67,15 @@ def render(
     ]
     title = f'{headline(facts)} \u2013 {facts["model"]["name"]}'
     body = [
+        tag('a', 'To the answer', href='#answer', class_='skip'),
         tag('nav', tag('div',
             tag('b', facts['model']['name']),
             [tag('a', name, href=f'#{key}') for key, name, _ in sections],
             tag('span', _day(facts)),
-        ), class_='bar'),
-        tag('main', [content for _, _, content in sections],
-            tag('footer', f'Drawn from {FILE_NAMES[facts["format"]]} and curves.npz. '
-                'Self-contained: works offline.')),
+        ), class_='bar', aria_label='parts of the page'),
+        tag('main', [content for _, _, content in sections]),
+        tag('footer', f'Drawn from {FILE_NAMES[facts["format"]]} and curves.npz. '
+            'Self-contained: works offline.'),
     ]  # fmt: skip
     head = [
         tag('meta', charset='utf-8'),

@@ -309,7 +309,8 @@
       const lines = [{ x: t, y: times1(measured, k), cls: 'measured' }];
       if (both) lines.push({ x: t, y: times1(sim.before, k), cls: 'before' });
       lines.push({ x: t, y: times1(sim.after, k), cls: 'after' });
-      drawn.push(chart(hosts[0], { height: 230, x: x, lines: lines, title: channel.name,
+      drawn.push(chart(hosts[0], { height: 230, x: x, lines: lines,
+        title: channel.name + ', measured and simulated',
         y: { lo: y[0], hi: y[1], label: channel.name + ' in ' + unit } }));
 
       const shown = state.close || !both ? [res.after] : [res.before, res.after];
@@ -321,7 +322,8 @@
       const left = [];
       if (both) left.push({ x: t, y: times1(res.before, k), cls: 'before' });
       left.push({ x: t, y: times1(res.after, k), cls: 'after' });
-      drawn.push(chart(hosts[1], { height: 180, x: x, lines: left, title: 'residual',
+      drawn.push(chart(hosts[1], { height: 180, x: x, lines: left,
+        title: 'residual of ' + channel.name,
         bands: [{ flat: 2 * sigma * k, cls: 'noise' }],
         y: { lo: -top, hi: top, label: 'residual in ' + unit } }));
 

@@ -2,11 +2,12 @@
 
 import math
 
-from cg_sysid.report.markup import Markup, tag
+from cg_sysid.report.markup import Markup, column, row, tag, wide
 from cg_sysid.report.wording import Facts, parameter_words
 from cg_sysid.text import effect_name, measured, number, plain_unit
 
 SHOWN = 6  # candidates of a round before the rest is folded away
+DEEPEST = 0.45  # share of colour in a cell of the heat map
 BELIEF_SPAN = 4.0  # tolerances on either side in the little plots
 
 
@@ -17,13 +18,13 @@ def rounds(facts: Facts) -> Markup | None:
     causes = {c['label']: {r['label'] for r in c['rivals']} | set(c['places'])
               for c in facts['causes']}  # fmt: skip
     return tag('section',
-        tag('h2', 'What was tried'),
+        tag('h2', 'What was tried', id='tried-title'),
         tag('p', 'Every effect of the library was fitted on top of the model, from several '
             'starts, to the first seconds and, where promising, to whole records. Evidence '
             'counts how strongly all records speak for it, after paying for its parameters; '
             'the error is judged on records held out.', class_='soft'),
         [_round(k, r, causes) for k, r in enumerate(facts['ranking'], start=1)],
-        id='tried',
+        id='tried', aria_labelledby='tried-title',
     )  # fmt: skip
 
 
@@ -40,9 +41,9 @@ def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
         tag('details',
             tag('summary', f'Round {k}: on top of {base} ',
                 tag('span', f'\u2013 {len(candidates)} candidates, {outcome}', class_='soft')),
-            tag('div', table, class_='scroll'),
+            wide(f'Candidates of round {k}', table),
             tag('details', tag('summary', f'{len(rest)} more candidates'),
-                tag('div', _ranking(rest, taken, rivals, strongest), class_='scroll'))
+                wide(f'More candidates of round {k}', _ranking(rest, taken, rivals, strongest)))
             if rest else None,
             tag('p', 'Ruled out by the first seconds of the records: ',
                 ', '.join(effect_name(label) for label in r['set_aside']), class_='small')
@@ -55,10 +56,10 @@ def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
 def _ranking(
     candidates: list[Facts], taken: str | None, rivals: set[str], strongest: float
 ) -> Markup:
-    head = tag('tr', tag('th', 'effect'), tag('th', 'evidence in nats', class_='num'),
-               tag('th', 'held-out error, in noise', class_='num'),
-               tag('th', 'significance', class_='num'),
-               tag('th', 'outcome'))  # fmt: skip
+    head = tag('tr', column('effect'), column('evidence in nats', class_='num'),
+               column('held-out error, in noise', class_='num'),
+               column('significance', class_='num'),
+               column('outcome'))  # fmt: skip
     columns = tag('colgroup', [tag('col', style=f'width:{w}%') for w in (32, 18, 14, 10, 26)])
     rows = [_candidate(c, taken, rivals, strongest) for c in candidates]
     return tag('table', columns, tag('thead', head), tag('tbody', rows), class_='ranking')
@@ -75,7 +76,7 @@ def _candidate(c: Facts, taken: str | None, rivals: set[str], strongest: float) 
     else:
         kind, outcome = '', tag('span', 'helps, but less', class_='soft small')
     return tag('tr',
-        tag('td', tag('b', effect_name(c['label'])),
+        row(tag('b', effect_name(c['label'])),
             tag('small', ', '.join(parameter_words(c['parameters'])))),
         tag('td', number(c['evidence_nats']), _meter(c['evidence_nats'], strongest),
             class_='num'),
@@ -100,7 +101,8 @@ def _fall(c: Facts) -> str:
 def _meter(value: float | None, strongest: float) -> Markup:
     # Square root: a rival at half the evidence must still be seen beside a winner of thousands.
     share = math.sqrt(max(value or 0.0, 0.0) / strongest) if strongest > 0 else 0.0
-    return tag('span', tag('i', style=f'width:{100 * min(share, 1.0):.0f}%'), class_='meter')
+    return tag('span', tag('i', style=f'width:{100 * min(share, 1.0):.0f}%'), class_='meter',
+               aria_hidden='true')
 
 
 def parameters(facts: Facts) -> Markup | None:
@@ -109,23 +111,23 @@ def parameters(facts: Facts) -> Markup | None:
     fixed = [p for p in facts['parameters'] if p['fixed']]
     if facts['verdict'] == 'unusable' or not (moved or fixed):
         return None
-    head = tag('tr', tag('th', 'parameter'), tag('th', 'model file', class_='num'),
-               tag('th', 'identified', class_='num'), tag('th', 'unit'),
-               tag('th', 'change in tolerances'), tag('th', 'known from data', class_='num'))
-    table = tag('div', tag('table', tag('thead', head), tag('tbody', [_row(p) for p in moved])),
-                class_='scroll')  # fmt: skip
+    head = tag('tr', column('parameter'), column('model file', class_='num'),
+               column('identified', class_='num'), column('unit'),
+               column('change in tolerances'), column('known from data', class_='num'))
+    table = wide('Identified parameters',
+                 tag('table', tag('thead', head), tag('tbody', [_row(p) for p in moved])))
     return tag('section',
-        tag('h2', 'Parameters'),
+        tag('h2', 'Parameters', id='parameters-title'),
         tag('p', 'The grey band is what the model file believes, one tolerance either way; the '
             'dot is the identified value, the bar its 95 % interval. The last column says how '
             'much of the certainty comes from the recordings rather than from the file.',
             class_='soft') if moved else None,
         table if moved else None,
         tag('details', tag('summary', f'{len(fixed)} held fixed'),
-            tag('div', tag('table', tag('tbody', [_fixed(p) for p in fixed])), class_='scroll'))
+            wide('Fixed parameters', _fixed_table(fixed)))
         if fixed else None,
         correlation(facts),
-        id='parameters',
+        id='parameters', aria_labelledby='parameters-title',
     )  # fmt: skip
 
 
@@ -138,7 +140,7 @@ def _row(p: Facts) -> Markup:
         value = measured(p['identified'], p['sigma'])
     nominal = measured(p['nominal'], p['tolerance'])
     return tag('tr',
-        tag('td', tag('b', p['name']), added, tag('small', p['description'])),
+        row(tag('b', p['name']), added, tag('small', p['description'])),
         tag('td', nominal, class_='num'),
         tag('td', value, class_='num'),
         tag('td', plain_unit(p['unit'])),
@@ -147,8 +149,14 @@ def _row(p: Facts) -> Markup:
     )  # fmt: skip
 
 
+def _fixed_table(fixed: list[Facts]) -> Markup:
+    head = tag('tr', column('parameter'), column('value', class_='num'), column('unit'),
+               column('source'))  # fmt: skip
+    return tag('table', tag('thead', head), tag('tbody', [_fixed(p) for p in fixed]))
+
+
 def _fixed(p: Facts) -> Markup:
-    return tag('tr', tag('td', p['name'], tag('small', p['description'])),
+    return tag('tr', row(p['name'], tag('small', p['description'])),
                tag('td', number(p['nominal'], 5), class_='num'),
                tag('td', plain_unit(p['unit'])),
                tag('td', p['source'], class_='soft'))  # fmt: skip
@@ -171,7 +179,8 @@ def _belief(p: Facts) -> Markup:
         tag('i', class_='about', style=band), tag('i', class_='centre', style='left:50%'),
         tag('i', class_='whisker', style=f'left:{a:.1f}%;width:{b - a:.1f}%'),
         tag('i', class_='dot out' if out else 'dot', style=f'left:{dot:.1f}%'),
-        class_='belief', title=f'{moved:+.2f} tolerances',
+        class_='belief', role='img', title=f'{moved:+.2f} tolerances',
+        aria_label=f'{moved:+.2f} tolerances',
     )  # fmt: skip
 
 
@@ -182,17 +191,17 @@ def correlation(facts: Facts) -> Markup | None:
         return None
     short = [_short(name) for name in names]
     body = [
-        tag('tr', tag('th', short[a]),
+        tag('tr', row(short[a]),
             [_cell(matrix[a][b], names[a], names[b]) if b < a else tag('td') for b in range(a)])
         for a in range(1, len(names))
     ]  # fmt: skip
-    head = tag('tr', tag('th'), [tag('th', name) for name in short[:-1]])
+    head = tag('tr', tag('td'), [column(name) for name in short[:-1]])
     return tag('div',
         tag('h3', 'Correlation of the identified values', style='margin-top:24px'),
         tag('p', 'Near +1 or \u22121 the recordings know a combination of two parameters better '
             'than each of them.', class_='soft'),
-        tag('div', tag('table', tag('thead', head), tag('tbody', body), class_='heat'),
-            class_='scroll'),
+        wide('Correlations',
+             tag('table', tag('thead', head), tag('tbody', body), class_='heat')),
     )  # fmt: skip
 
 
@@ -205,8 +214,8 @@ def _cell(r: float | None, a: str, b: str) -> Markup:
     if r is None:
         return tag('td', '\u2013')
     tone = 'var(--after)' if r > 0 else 'var(--before)'
-    share = round(100 * min(abs(r), 1.0) ** 1.5 * 0.8)
-    ink = ';color:var(--paper)' if share > 55 else ''
+    # Up to there the ink of the page keeps a contrast of 4.5, by day and by night.
+    share = round(100 * min(abs(r), 1.0) ** 1.5 * DEEPEST)
     text = f'{r:+.2f}'.replace('-', '\u2212')
     return tag('td', text, title=f'{a}, {b}: {text}',
-               style=f'background:color-mix(in srgb, {tone} {share}%, var(--panel)){ink}')
+               style=f'background:color-mix(in srgb, {tone} {share}%, var(--panel))')
