@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cg_sysid import bags, parallel
@@ -125,6 +126,11 @@ def print_causes(console: Console, facts: Facts) -> None:
             console.print(f'    or: {effect_name(rival["label"])}')
         if cause['places']:
             console.print(f'    or elsewhere: {", ".join(cause["places"])}')
+
+
+def print_next(console: Console, facts: Facts) -> None:
+    """What to do next."""
+    console.print(f'[bold]next[/]  {escape(facts["next"])}', highlight=False)
 
 
 def print_left_out(facts: Facts) -> None:

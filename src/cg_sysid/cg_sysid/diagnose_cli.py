@@ -316,6 +316,7 @@ def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
         console.print(
             '  [yellow]note[/] the same command with a larger --budget goes on from here'
         )
+    cli.print_next(console, facts)
     console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
 
 

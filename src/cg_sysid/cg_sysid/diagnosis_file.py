@@ -35,6 +35,7 @@ from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
 from cg_sysid.landing_cause import landing_gains, words
 from cg_sysid.leftover import leftover
+from cg_sysid.next_step import next_step
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import Unknown
 from cg_sysid.unmodelled import term_words, variable_words
@@ -71,7 +72,7 @@ def diagnosis_facts(
         np.vstack([c.train.mse, c.held.mse]) for c in (diagnosis.baseline, diagnosis.extended)
     ]
     counts = np.vstack([fit.count, diagnosis.extended.held.count])
-    return plain({
+    return _with_next({
         **_head(
             DIAGNOSIS, diagnosis.verdict, diagnosis.summary + _in_spite_of(intake),
             diagnosis.nominal,
@@ -113,7 +114,7 @@ def unusable_facts(
         reason: Why nothing was fitted, one sentence.
         provenance: See provenance.py.
     """
-    return plain({
+    return _with_next({
         **_head(DIAGNOSIS, 'unusable', reason + _in_spite_of(intake), model),
         'causes': [],
         'gain': {},
@@ -175,7 +176,7 @@ def identification_facts(
         f'{"" if fit.converged else "; it stopped before it had converged"}.'
     )
     errors = [before.mse if before else np.full_like(fit.mse, np.nan), fit.mse]
-    return plain({
+    return _with_next({
         **_head(IDENTIFICATION, 'identified', summary + _in_spite_of(intake), model),
         'method': method,
         'causes': [],
@@ -200,6 +201,11 @@ def identification_facts(
         **_data(model, trials, ('all',) * len(trials), errors, fit.count, intake),
         'provenance': dict(provenance),
     })
+
+
+def _with_next(facts: Facts) -> Facts:
+    found = plain(facts)
+    return {**found, 'next': next_step(found)}
 
 
 def _head(form: str, verdict: str, summary: str, model: Model) -> Facts:

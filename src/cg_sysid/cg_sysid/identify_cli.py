@@ -176,6 +176,7 @@ def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
         console.print(table, highlight=False)
         cli.print_gain(console, facts)
         cli.print_findings(console, facts['findings'])
+    cli.print_next(console, facts)
     console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
 
 

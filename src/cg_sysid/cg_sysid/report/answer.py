@@ -55,6 +55,7 @@ def answer(facts: Facts, drawn: Facts) -> Markup:
         tag('span', verdict, class_='verdict', title=VERDICTS[verdict]),
         tag('h1', sentence(headline(facts)), id='answer-title'),
         tag('p', lead(facts), class_='lead'),
+        tag('p', tag('b', 'Next: '), facts['next'], class_='todo') if facts.get('next') else None,
         tag('div', tag('div', left) if left else None, tag('div', right) if right else None,
             class_='columns' if both else 'columns one'),
         class_=f'hero {verdict}', id='answer', aria_labelledby='answer-title',
