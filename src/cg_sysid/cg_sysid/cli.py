@@ -13,7 +13,13 @@ from rich.table import Table
 from cg_sysid import bags, parallel
 from cg_sysid.check import use_anyway_option
 from cg_sysid.deadline import OutOfTime
-from cg_sysid.report.wording import event_words, left_words, undetermined_words, value_words
+from cg_sysid.report.wording import (
+    event_words,
+    left_words,
+    replaced_words,
+    undetermined_words,
+    value_words,
+)
 from cg_sysid.text import effect_name, number, plain_unit
 
 BAD_INPUT = 2
@@ -120,7 +126,7 @@ def print_causes(console: Console, facts: Facts) -> None:
         strength = cause['evidence_nats']
         strength = f'  (evidence {strength:.0f} nats)' if strength is not None else ''
         console.print(f'  [bold]{effect_name(cause["label"])}[/]: {numbers}{strength}')
-        for words in (*event_words(cause), *undetermined_words(cause)):
+        for words in (*event_words(cause), *replaced_words(cause), *undetermined_words(cause)):
             console.print(f'    {words}', highlight=False, markup=False)
         for rival in cause['rivals']:
             console.print(f'    or: {effect_name(rival["label"])}')

@@ -26,8 +26,10 @@ from cg_sysid.advice import Proposal, propose
 from cg_sysid.by_recording import what_wanders
 from cg_sysid.candidates import (
     SAME,
+    SURE,
     THOROUGH_ITERATIONS,
     Outcome,
+    TOO_SMALL,
     Task,
     candidates_for,
     chi2,
@@ -919,7 +921,27 @@ def _as_in(final: Outcome, cause: Cause) -> Cause:
             name.removeprefix(prefix) for name in final.train.undetermined
             if name.startswith(prefix)
         ),
+        replaces=tuple(e.label for e in final.model.effects if _idle(final, cause.label, e.label)),
     )  # fmt: skip
+
+
+def _idle(o: Outcome, label: str, other: str) -> bool:
+    """Whether an effect does the work of a simpler one that the nominal model has.
+
+    The simpler one is nothing to within its uncertainty, and at the size that the file states the
+    records would have shown it.
+    """
+    if other in imperfect(o.model, o.task.bounds) or not contains(label, other):
+        return False
+    name, (value, sigma, _) = next(iter(parameters_of(o, other).items()), ('', (np.inf, 0.0, '')))
+    first = o.model.effect(other).parameters[0]
+    stated = o.model.quantities.get(f'{other}.{name}')
+    if name != first.name or first.neutral is None or stated is None:
+        return False
+    return (
+        abs(value - first.neutral) <= TOO_SMALL * sigma
+        and abs(stated.value - first.neutral) > SURE * sigma
+    )
 
 
 def _cause_among(final: Outcome, label: str, contests: Sequence[Contest]) -> Cause:

@@ -108,6 +108,7 @@ class Cause:
         places: Labels of the same effect at other places that explain the records as well.
         proposals: Experiments that would tell it from its rivals, best first.
         undetermined: Parameters of which the records do not even tell the order.
+        replaces: Labels of simpler effects of the nominal model that it makes idle.
         events: What happened in single records: record -> parameter -> (value, standard
             deviation, unit).
     """
@@ -120,6 +121,7 @@ class Cause:
     events: Mapping[str, Mapping[str, tuple[float, float, str]]] = field(default_factory=dict)
     proposals: tuple[Proposal, ...] = ()
     undetermined: tuple[str, ...] = ()
+    replaces: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -315,7 +317,8 @@ def described(cause: Cause) -> str:
     """A cause with its numbers and rivals, in words."""
     numbers = ', '.join(f'{name} {_told(cause, name)}' for name in cause.parameters)
     rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
-    return f'{cause.label} ({numbers}){rivals}'
+    replaced = f', which replaces {listed(list(cause.replaces))}' if cause.replaces else ''
+    return f'{cause.label} ({numbers}){rivals}{replaced}'
 
 
 def _told(cause: Cause, name: str) -> str:

@@ -1,5 +1,6 @@
 """The answer in words."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -84,3 +85,26 @@ def test_a_simpler_effect_is_contained_at_the_same_place_only():
     assert contains('stribeck_friction@elbow', 'coulomb_friction@elbow')
     assert not contains('stribeck_friction@elbow', 'coulomb_friction@shoulder')
     assert not contains('coulomb_friction', 'stribeck_friction')
+
+
+@pytest.mark.parametrize(('left', 'replaces'), [(0.0, ('coulomb_friction',)), (0.9, ())])
+def test_a_law_that_does_the_work_of_the_models_own_replaces_it(model_file, left, replaces):
+    """Bristles in a machine that has some plain dry friction beside them, or none."""
+    nominal = Model.load(model_file)
+    level = nominal.values['coulomb_friction.torque']
+    machine = nominal.with_values({'coulomb_friction.torque': left})
+    machine = machine.with_effect('presliding_friction', torque=level - left, deflection=0.03)
+    records = [
+        rehearse(f'swing {k}', machine, Setup('inner', 'inner_fixed'), [0.1 * k, 0.5],
+                 [lambda t, k=k: 6.0 * math.sin(2 * math.pi * (0.4 + 0.2 * k + 0.15 * t) * t)],
+                 4.0, 0.004, k)
+        for k in range(4)
+    ]  # fmt: skip
+    options = Options(effects=('presliding_friction', 'torque_bias'), workers=0)
+    found = diagnose(nominal, records, options)
+    assert [(c.label, c.replaces) for c in found.causes] == [('presliding_friction', replaces)]
+    assert ('which replaces coulomb_friction' in found.summary) == bool(replaces)
+    # What is left of the model's own is what the machine has: 5 standard deviations.
+    fit = found.extended.train
+    at = [u.name for u in fit.unknowns].index('coulomb_friction.torque')
+    assert abs(fit.values[at] - left) < 5 * fit.sigmas[at]

@@ -13,6 +13,7 @@ from cg_sysid.report.wording import (
     lead,
     left_words,
     parameter_words,
+    replaced_words,
     undetermined_words,
 )
 from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
@@ -115,6 +116,7 @@ def _cause(cause: Facts) -> Markup:
         tag('h2', sentence(effect_name(cause['name'])), where),
         [tag('p', words, class_='big') for words in parameter_words(cause['parameters'])],
         [tag('p', words, class_='soft') for words in event_words(cause)],
+        [tag('p', f'{sentence(words)}.') for words in replaced_words(cause)],
         [tag('p', f'{sentence(words)}.', class_='doubt') for words in undetermined_words(cause)],
         tag('p', cause['description'], class_='soft'),
         tag('p', f'{proof}{PLACES.get(cause["place"], "")}.', class_='soft small'),

@@ -187,6 +187,12 @@ def event_words(cause: Facts) -> list[str]:
     return [*found[:MOST_EVENTS], f'and {more} more in diagnosis.json'] if more > 0 else found
 
 
+def replaced_words(cause: Facts) -> list[str]:
+    """That it makes an effect of the model itself idle, in at most one sentence."""
+    names = [effect_name(label) for label in cause.get('replaces', ())]
+    return [f'it replaces {listed(names)} of the model, of which nothing is left'] if names else []
+
+
 def undetermined_words(cause: Facts) -> list[str]:
     """That the records do not determine some of its parameters, in at most one sentence."""
     names = [name.replace('_', ' ') for name in cause.get('undetermined', ())]
