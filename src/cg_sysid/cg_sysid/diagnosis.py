@@ -25,6 +25,8 @@ from cg_sysid.wandering import Wandering
 MOST_ROUNDS = 4
 NO_GAIN = 1.1  # times the error after, below which the error before is the same
 INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
+MOST_TOLD = 3  # events of single records in the summary
+CERTAIN = 30.0  # nats: odds of 1e13 to 1, beyond what a noise floor a little off could feign
 MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
 
 
@@ -285,9 +287,9 @@ def summary_of(
         )
     else:
         text = (
-            f'The simulation lacks {named}; with it the held-out error of {biggest.channel} '
-            f'falls from {biggest.before:.3g} to {biggest.after:.3g} {biggest.unit} '
-            f'(noise {biggest.noise:.2g}).'
+            f'The simulation lacks {named}, {_sureness(causes)}; with it the held-out error of '
+            f'{biggest.channel} falls from {biggest.before:.3g} to {biggest.after:.3g} '
+            f'{biggest.unit} (noise {biggest.noise:.2g}).'
         )
     vague = [f'{c.label}.{name}' for c in causes for name in c.undetermined]
     if vague:
@@ -315,10 +317,47 @@ def summary_of(
 
 def described(cause: Cause) -> str:
     """A cause with its numbers and rivals, in words."""
-    numbers = ', '.join(f'{name} {_told(cause, name)}' for name in cause.parameters)
+    own = _of_single_records(cause)
+    shared = [name for name in cause.parameters if not own or name not in own]
+    numbers = ', '.join(f'{name} {_told(cause, name)}' for name in shared)
+    happened = _happened(cause, own) if own else []
+    inside = '; '.join(part for part in (*happened, numbers) if part)
     rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
     replaced = f', which replaces {listed(list(cause.replaces))}' if cause.replaces else ''
-    return f'{cause.label} ({numbers}){rivals}{replaced}'
+    return f'{cause.label} ({inside}){rivals}{replaced}'
+
+
+def _of_single_records(cause: Cause) -> tuple[str, ...]:
+    """Names of what happened in single records, as a push; none where nothing surely did."""
+    kind = LIBRARY.get(effect_name(cause.label))
+    if kind is None or not cause.events:
+        return ()
+    return tuple(p.name for p in kind.parameters if p.each == 'record')
+
+
+def _happened(cause: Cause, names: Sequence[str]) -> list[str]:
+    """Each event with its record, the largest first; how many more there are."""
+    ordered = sorted(cause.events, key=lambda record: -abs(cause.events[record][names[0]][0]))
+    told = [
+        f'in {record} ' + ', '.join(
+            f'{name} = {measured(*cause.events[record][name])}' for name in names
+        )
+        for record in ordered[:MOST_TOLD]
+    ]
+    more = len(ordered) - len(told)
+    return [*told, *([f'and {more} more'] if more else [])]
+
+
+def _sureness(causes: Sequence[Cause]) -> str:
+    """How sure the least sure of the causes is, in words and in nats."""
+    least = min(cause.evidence for cause in causes)
+    if not np.isfinite(least):
+        return 'for sure, as nothing follows the records without it'
+    nats = f'{number(least)} nats of evidence'
+    if any(cause.rivals for cause in causes):
+        return f'one or the other for sure ({nats})' if least >= CERTAIN else (
+            f'one or the other quite surely ({nats})')
+    return f'for sure ({nats})' if least >= CERTAIN else f'quite surely ({nats})'
 
 
 def _told(cause: Cause, name: str) -> str:

@@ -108,3 +108,43 @@ def test_a_law_that_does_the_work_of_the_models_own_replaces_it(model_file, left
     fit = found.extended.train
     at = [u.name for u in fit.unknowns].index('coulomb_friction.torque')
     assert abs(fit.values[at] - left) < 5 * fit.sigmas[at]
+
+
+def _gain():
+    return (Gain('hip_angle', 'rad', 1e-2, 1e-4, 1e-4),)
+
+
+def test_pushes_are_told_one_by_one_the_largest_first():
+    events = {
+        f'swing_{k}': {'impulse': (size, 0.02, 'N s'), 'instant': (1.0 + k, 0.004, 's')}
+        for k, size in enumerate((0.5, -6.01, 6.01, 2.0))
+    }
+    parameters = {**events['swing_1'], 'duration': (0.05, 0.002, 's')}
+    text = summary_of('explained', [Cause('external_push', parameters, 90.0, events=events)],
+                      _gain(), {})  # fmt: skip
+    assert ' from ' not in text.partition('; with it')[0]
+    told = [text.index(f'in swing_{k} impulse = ') for k in (1, 2, 3)]
+    assert told == sorted(told)
+    assert 'in swing_3 impulse = 2.000 \u00b1 0.020 N s, instant = 4.0000 \u00b1 0.0040 s' in text
+    assert 'and 1 more; duration = 50.0 \u00b1 2.0 ms' in text
+    assert 'swing_0' not in text
+
+
+@pytest.mark.parametrize(
+    ('evidence', 'rivals', 'words'),
+    [
+        (12.0, (), 'quite surely (12.0 nats of evidence)'),
+        (90.0, (), 'for sure (90.0 nats of evidence)'),
+        (90.0, ('back_emf',), 'one or the other for sure (90.0 nats of evidence)'),
+        (float('inf'), (), 'for sure, as nothing follows the records without it'),
+    ],
+)
+def test_the_first_sentence_says_how_sure_the_least_sure_cause_is(evidence, rivals, words):
+    causes = [
+        Cause('imu_scale', {'scale': (1.02, 1e-3, '1')}, 1e3),
+        Cause('torque_constant', {'error': (-0.1, 0.02, '1')}, evidence, rivals),
+    ]
+    verdict = 'ambiguous' if rivals else 'explained'
+    if evidence == float('inf'):
+        causes = causes[1:]
+    assert words in summary_of(verdict, causes, _gain(), {}).partition(';')[0]
