@@ -107,7 +107,9 @@ def build(
         c.write_text(source)
         files = [str(made), str(c), *map(str, objects)]
         command = [gcc, *flags, *PRODUCTS[target.suffix], '-o', *files, '-lm']
-        result = subprocess.run(command, capture_output=True, text=True)
+        # A signal to our group, as of Ctrl-C, is for us to hear: a compiler that dies of it looks
+        # like one that refuses the model.
+        result = subprocess.run(command, capture_output=True, text=True, process_group=0)
         if result.returncode:
             raise RuntimeError(f'{gcc} failed on a generated model:\n{result.stderr[:2000]}')
         # Two processes may build the same model; the last rename wins and both are equal.

@@ -1,5 +1,8 @@
 """Compiled rollouts: sensitivities against differences, inputs, delays, cache and failures."""
 
+import os
+import sys
+
 import numpy as np
 import pytest
 
@@ -243,6 +246,20 @@ def test_library_may_be_kept_in_a_relative_directory(bare, tmp_path, monkeypatch
     monkeypatch.setenv('CG_CACHE', '')
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
     assert c_compiler.cache_directory() == tmp_path / 'cache' / 'compass_gait'
+
+
+def test_the_compiler_does_not_hear_what_a_terminal_tells_us(tmp_path, monkeypatch):
+    """A stand-in for it: a signal to our process group is not one to its own."""
+    group = tmp_path / 'group'
+    stand_in = tmp_path / 'cc'
+    stand_in.write_text(
+        f'#!/bin/sh\n{sys.executable} -c "import os; print(os.getpgrp())" > {group}\n'
+        'while [ "$1" != -o ]; do shift; done; : > "$2"\n'
+    )
+    stand_in.chmod(0o755)
+    monkeypatch.setattr(c_compiler, 'compiler', lambda: str(stand_in))
+    c_compiler.build('int f;', tmp_path / 'f.so')
+    assert int(group.read_text()) != os.getpgrp()
 
 
 def test_arrays_of_wrong_shape_are_refused(bare):
