@@ -352,12 +352,10 @@ def _sureness(causes: Sequence[Cause]) -> str:
     """How sure the least sure of the causes is, in words and in nats."""
     least = min(cause.evidence for cause in causes)
     if not np.isfinite(least):
-        return 'for sure, as nothing follows the records without it'
-    nats = f'{number(least)} nats of evidence'
-    if any(cause.rivals for cause in causes):
-        return f'one or the other for sure ({nats})' if least >= CERTAIN else (
-            f'one or the other quite surely ({nats})')
-    return f'for sure ({nats})' if least >= CERTAIN else f'quite surely ({nats})'
+        return 'very likely, as the model without it does not follow the records at all'
+    sure = 'very likely' if least >= CERTAIN else 'likely'
+    either = 'one or the other ' if any(cause.rivals for cause in causes) else ''
+    return f'{either}{sure} ({number(least)} nats of evidence)'
 
 
 def _told(cause: Cause, name: str) -> str:

@@ -133,10 +133,10 @@ def test_pushes_are_told_one_by_one_the_largest_first():
 @pytest.mark.parametrize(
     ('evidence', 'rivals', 'words'),
     [
-        (12.0, (), 'quite surely (12.0 nats of evidence)'),
-        (90.0, (), 'for sure (90.0 nats of evidence)'),
-        (90.0, ('back_emf',), 'one or the other for sure (90.0 nats of evidence)'),
-        (float('inf'), (), 'for sure, as nothing follows the records without it'),
+        (12.0, (), 'likely (12.0 nats of evidence)'),
+        (90.0, (), 'very likely (90.0 nats of evidence)'),
+        (90.0, ('back_emf',), 'one or the other very likely (90.0 nats of evidence)'),
+        (float('inf'), (), 'very likely, as the model without it does not follow the records'),
     ],
 )
 def test_the_first_sentence_says_how_sure_the_least_sure_cause_is(evidence, rivals, words):
