@@ -15,7 +15,7 @@ import yaml
 
 from cg_bringup.balance_run import MACHINE, carry_out
 from cg_bringup.balancing import FALLEN
-from cg_bringup.runs import MODES, NodeOf
+from cg_bringup.runs import MODES, PEERS, NodeOf
 from cg_bringup.verdict import rebalance_verdict
 from cg_control.tracking import REMEDIES
 from cg_description.paths import model_path
@@ -63,6 +63,7 @@ def rebalance_nodes(options: RebalanceOptions) -> dict[str, NodeOf]:
         'seed': options.seed,
         'duration': options.duration,
         'await_answer': True,
+        'peer_timeout': PEERS,
         'experiment': 'one_step_rebalance',
         'exit_when_done': True,
         'fall_angle': FALLEN,
@@ -77,6 +78,7 @@ def rebalance_nodes(options: RebalanceOptions) -> dict[str, NodeOf]:
         'model_file': options.model,
         'remedy': options.remedy,
         'start_after': options.start_after,
+        'await_trajectory': options.start_after > 0.0,
         **rate,
     }
     observer = {'model_file': options.model}

@@ -19,7 +19,7 @@ import yaml
 
 from cg_bringup.balance_run import MACHINE, carry_out
 from cg_bringup.balancing import FALLEN
-from cg_bringup.runs import CLOSING, MODES, NOMINAL_MODEL, NodeOf
+from cg_bringup.runs import CLOSING, MODES, NOMINAL_MODEL, PEERS, NodeOf
 from cg_bringup.verdict import recovery_verdict
 from cg_control.grow_tree import BOX
 from cg_control.growth import Region
@@ -114,6 +114,7 @@ def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
         'seed': options.seed,
         'duration': options.duration,
         'await_answer': True,
+        'peer_timeout': PEERS,
         'experiment': 'recover_balance',
         'closed_loop': True,
         'exit_when_done': True,

@@ -58,6 +58,10 @@ class TvlqrNodeSettings(ExecutionSettings):
         0.0, 'start the selected trajectory unasked, once, after balancing for so long; 0: never',
         unit='s', minimum=0.0, live=True,
     )  # fmt: skip
+    await_trajectory: bool = setting(
+        False, 'answer no state before a trajectory is selected: a machine that waits for answers '
+        'begins with it, however long planning takes',
+    )  # fmt: skip
 
 
 class TvlqrNode(Node):
@@ -148,6 +152,9 @@ class TvlqrNode(Node):
         stamp_ns = to_nanoseconds(message.header.stamp)
         if stamp_ns == self._last_ns:
             self.publisher.publish(self.message)
+            return
+        waiting = self.declared.values.await_trajectory and self.trajectory is None
+        if waiting and self._last_ns is None:
             return
         if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
             self.controller.interrupt()

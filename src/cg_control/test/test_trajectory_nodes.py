@@ -77,11 +77,7 @@ class Bench:
 
     def tell(self, stamp_ns, x, stance='inner'):
         """Publish a state and return the torque that answers it."""
-        message = JointState(
-            name=['inner', 'outer'], position=[float(a) for a in x[:2]],
-            velocity=[float(a) for a in x[2:4]],
-        )  # fmt: skip
-        message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), f'{stance}_foot'
+        message = state_message(stamp_ns, x, stance)
         heard = len(self.commands)
         self.state.publish(message)
         self.until(lambda: len(self.commands) > heard)
@@ -93,6 +89,15 @@ class Bench:
         for node in self.nodes:
             self.executor.remove_node(node)
             node.destroy_node()
+
+
+def state_message(stamp_ns, x, stance='inner'):
+    message = JointState(
+        name=['inner', 'outer'], position=[float(a) for a in x[:2]],
+        velocity=[float(a) for a in x[2:4]],
+    )  # fmt: skip
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), f'{stance}_foot'
+    return message
 
 
 @pytest.fixture
@@ -178,6 +183,16 @@ def test_controller_balances_follows_and_stops(bench, step):
         assert torque == pytest.approx(step.at(t).torque, abs=1e-6)
     bench.order.publish(JointTrajectory(joint_names=['inner', 'outer']))
     bench.until(lambda: node.controller.mode != 'tracking')
+
+
+@pytest.mark.alone
+def test_controller_can_wait_for_its_trajectory(bench, step):
+    node = bench.add(TvlqrNode(parameter_overrides=[Parameter('await_trajectory', value=True)]))
+    node.on_state(state_message(1_000_000_000, np.zeros(4)))
+    assert node.controller.mode == 'idle'
+    node.on_selected(String(data=step.text()))
+    node.on_state(state_message(1_000_000_000, np.zeros(4)))
+    assert node.controller.mode == 'balancing'
 
 
 @pytest.mark.alone

@@ -59,14 +59,15 @@ class SimulationSettings(Settings):
     )
     answer_timeout: float = setting(
         5.0,
-        'lock-step: longest wait for the answer to a measurement before the run is given up',
+        'lock-step: longest wait for the answer to a measurement before the run is given up; for '
+        'the first it is peer_timeout',
         unit='s',
         minimum=0.01,
         maximum=600.0,
     )
     peer_timeout: float = setting(
         20.0,
-        'longest wait, at the start, for recorders and (lock-step) a controller',
+        'longest wait, at the start, for recorders and (lock-step) a controller and its answer',
         unit='s',
         minimum=0.1,
         maximum=600.0,

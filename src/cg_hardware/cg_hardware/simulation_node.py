@@ -376,8 +376,14 @@ class SimulationNode(LifecycleNode):
         self._awaiting = True
         self._held_back = False
         now = time.monotonic()
-        self._deadline = now + self.settings.answer_timeout
+        self._wait = self._longest_wait()
+        self._deadline = now + self._wait
         self._repeat_at = now + REPEAT
+
+    def _longest_wait(self) -> float:
+        # A peer that plans or loads before it controls takes as long to begin as one that starts.
+        begins = self.ticks == 0
+        return self.settings.peer_timeout if begins else self.settings.answer_timeout
 
     def _answered(self) -> None:
         """Apply what the gate makes of the answer, and go on."""
@@ -395,7 +401,8 @@ class SimulationNode(LifecycleNode):
             if behind > RECORDER_WINDOW * NANOSECONDS / self.settings.sample_rate_hz:
                 if not self._held_back:
                     self._held_back = True
-                    self._deadline = time.monotonic() + self.settings.answer_timeout
+                    self._wait = self.settings.answer_timeout
+                    self._deadline = time.monotonic() + self._wait
                 return
         self._present()
 
@@ -420,7 +427,7 @@ class SimulationNode(LifecycleNode):
         if self._awaiting and self.ticks == 0:
             self._repeat_first(now)
         if now > self._deadline:
-            waited = f'{self.settings.answer_timeout:g} s'
+            waited = f'{self._wait:g} s'
             if self._awaiting:
                 seconds = (self._stamp() - self.epoch_ns) / NANOSECONDS
                 self._fail(

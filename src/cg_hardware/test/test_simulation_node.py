@@ -132,6 +132,16 @@ def test_lockstep_peer_that_falls_silent_ends_the_run_with_zero_torque(bench):
     assert [m.effort[0] for m in bench.applied] == [5.0] * 10 + [0.0]
 
 
+def test_lockstep_first_answer_may_take_as_long_as_a_peer_that_starts(bench):
+    machine = bench.machine(mode='lockstep', duration=0.01, answer_timeout=0.05)
+    begun = time.monotonic()
+    bench.until(lambda: time.monotonic() > begun + 0.2)
+    assert machine.phase == 'running'
+    bench.answer = lambda message: 1.0
+    bench.until(lambda: machine.phase == 'off' and len(bench.applied) >= 5)
+    assert machine.exit_status == 0
+
+
 def test_lockstep_works_through_the_safety_gate(bench):
     bench.add(SafetyGateNode(parameter_overrides=[Parameter('torque_limit', value=2.0)]))
     bench.controller.destroy_publisher(bench.command)
