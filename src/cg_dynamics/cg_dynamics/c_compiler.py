@@ -109,7 +109,7 @@ def build(
         command = [gcc, *flags, *PRODUCTS[target.suffix], '-o', *files, '-lm']
         # A signal to our group, as of Ctrl-C, is for us to hear: a compiler that dies of it looks
         # like one that refuses the model.
-        result = subprocess.run(command, capture_output=True, text=True, process_group=0)
+        result = subprocess.run(command, capture_output=True, text=True, start_new_session=True)
         if result.returncode:
             raise RuntimeError(f'{gcc} failed on a generated model:\n{result.stderr[:2000]}')
         # Two processes may build the same model; the last rename wins and both are equal.

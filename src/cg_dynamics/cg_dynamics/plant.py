@@ -133,6 +133,12 @@ class Plant:
         self._applied = self._inputs(np.clip(torque, -limit, limit))
         self._latches.append((self.time, self._applied))
 
+    @property
+    def _clock(self) -> float:
+        # Effects see a clock that is held from sample to sample as the torque is. Its middle is
+        # right to second order; a drifting sensor is read half a sample ahead.
+        return self.time + self.sample_ns * 1e-9 / 2
+
     def _inputs(self, torque: np.ndarray) -> np.ndarray:
         # Extra inputs of the simulated machine are switches that are on; `stamped` sets the time.
         return np.concatenate([torque, np.ones(self._compiled.nu - self._torques)])
@@ -149,7 +155,7 @@ class Plant:
         first = bisect.bisect_right(times, start + 1e-12) - 1
         edges = [start, *(t for t in times[first + 1 :] if t < end - 1e-12), end]
         for index, (begin, stop) in enumerate(itertools.pairwise(edges)):
-            u = stamped(self._latches[first + index][1], self._compiled.input_names, start)
+            u = stamped(self._latches[first + index][1], self._compiled.input_names, self._clock)
             steps = max(1, int(np.ceil((stop - begin) / self._fine - 1e-9)))
             self._move(u, (stop - begin) / steps, steps)
         self._latches = self._latches[first:]
@@ -241,11 +247,11 @@ class Plant:
 
     def _clean_outputs(self) -> np.ndarray:
         held, names = self._latches[-1][1], self._compiled.input_names
-        u = stamped(held, names, self.time)
+        u = stamped(held, names, self._clock)
         now = np.asarray(self._compiled.h(self._x, u, self._p)).ravel()
         for j in np.flatnonzero(self._output_delays):
             late = self.time - self._output_delays[j]
-            u = stamped(held, names, late)
+            u = stamped(held, names, late + self._clock - self.time)
             now[j] = np.asarray(self._compiled.h(self._at(late), u, self._p))[j, 0]
         return now
 

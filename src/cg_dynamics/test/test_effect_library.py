@@ -21,6 +21,7 @@ from cg_dynamics.rig import Setup, Spring
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]
 TIME = np.arange(0, 0.4, 0.002)
+HALF = 0.5 * (TIME[1] - TIME[0])  # a clock is held from row to row
 TORQUE = 6 * np.sin(2 * np.pi * 3 * TIME)
 START = np.array([0.05, 0.12, 0.2, -0.3])
 SPRING = Spring('inner', point=0.9, anchor=(-0.6, 1.0), stiffness=400.0, free_length=0.3)
@@ -65,7 +66,9 @@ def motion_of(setup):
 
 def inputs_of(model, setup, torque=TORQUE, time=TIME):
     extra = compile_model(model, setup).input_names[1:]
-    columns = [time if name == 'time' else np.ones(len(time)) for name in extra]
+    columns = [
+        time + HALF if name == 'time' else np.ones(len(time)) for name in extra
+    ]
     return np.column_stack([torque, *columns])
 
 
@@ -376,7 +379,7 @@ def test_presliding_joint_yields_like_a_spring_and_then_slides(bare):
         ('encoder_scale', {'error': 0.03}, 2, lambda y: 1.03 * y),
         ('imu_scale', {'error': -0.04}, 0, lambda y: 0.96 * y),
         ('gyro_scale', {'error': 0.05}, 1, lambda y: 1.05 * y),
-        ('imu_drift', {'rate': 0.01}, 0, lambda y: y + 0.01 * TIME),
+        ('imu_drift', {'rate': 0.01}, 0, lambda y: y + 0.01 * (TIME + HALF)),
         ('encoder_eccentricity', {'amplitude': 0.02, 'phase': 0.3}, 2,
          lambda y: y + 0.02 * np.sin(y + 0.3)),
     ],

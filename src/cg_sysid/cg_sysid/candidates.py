@@ -230,7 +230,8 @@ def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
         o: The outcome to go on from.
         trials: Those of its training, then those held out.
     """
-    start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    both = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    start = started_from(both, o.model, o.task.bounds)
     try:
         return fit(o.model, trials, start=start, own=o.events, bounds=o.task.bounds, thorough=True,
                    iterations=THOROUGH_ITERATIONS)  # fmt: skip
@@ -526,19 +527,30 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
 
 
 def events_of(o: Outcome, label: str) -> dict[str, dict[str, tuple[float, float, str]]]:
-    """What surely happened in single records: record -> own parameter -> (value, sigma, unit)."""
-    found = {}
-    for f, names in ((o.train, o.trials[0]), (o.held, o.trials[1])):
-        for name, motion, sigmas in zip(names, f.motions, f.own_sigmas, strict=True):
-            values = motion[len(motion) - len(f.own) :]
-            row = {
-                u.name.removeprefix(f'{label}.'): (float(v), float(s), u.unit)
-                for u, v, s in zip(f.own, values, sigmas, strict=True)
-                if u.name.startswith(f'{label}.')
-            }
-            if row and _sureness(row) > SURE:
-                found[name] = row
-    return found
+    """What surely happened in single records: record -> own parameter -> (value, sigma, unit).
+
+    The intervals of held-out records take the shared numbers for certain; `events_in` of a fit to
+    all records (fit_to_all) does not.
+    """
+    train, held = o.trials
+    return {**events_in(o.train, train, label), **events_in(o.held, held, label)}
+
+
+def events_in(
+    found: Fit, names: Sequence[str], label: str
+) -> dict[str, dict[str, tuple[float, float, str]]]:
+    """What surely happened, by one fit to the records of these names; as `events_of`."""
+    events = {}
+    for name, motion, sigmas in zip(names, found.motions, found.own_sigmas, strict=True):
+        values = motion[len(motion) - len(found.own) :]
+        row = {
+            u.name.removeprefix(f'{label}.'): (float(v), float(s), u.unit)
+            for u, v, s in zip(found.own, values, sigmas, strict=True)
+            if u.name.startswith(f'{label}.')
+        }
+        if row and _sureness(row) > SURE:
+            events[name] = row
+    return events
 
 
 def _sureness(event: Mapping[str, tuple[float, float, str]]) -> float:

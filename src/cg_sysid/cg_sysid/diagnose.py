@@ -33,6 +33,7 @@ from cg_sysid.candidates import (
     Task,
     candidates_for,
     chi2,
+    events_in,
     events_of,
     first_seconds,
     fit_to_all,
@@ -749,7 +750,7 @@ class _Search:
         final = self._less_mishaps(nominal, final)
         causes = self._causes(nominal, final)
         final = self._thorough(final)
-        causes = [_as_in(final, cause) for cause in causes]
+        causes = [self._with_events(final, _as_in(final, cause)) for cause in causes]
         left = self._left(final)
         wandering = self._wandering(final) if left else None
         if wandering and unmodelled and unmodelled.explained > wandering.explained:
@@ -758,6 +759,24 @@ class _Search:
         verdict = verdict_of(causes, bool(left), share)
         late = self._late_samples(self._gains(nominal, final)) if verdict == 'unexplained' else ''
         return self._answer(nominal, final, causes, verdict, unmodelled, wandering, late)
+
+    def _with_events(self, final: Outcome, cause: Cause) -> Cause:
+        """The cause with what every record has of its own by a fit to all records.
+
+        A held-out record takes the shared numbers for certain, and its intervals are too narrow;
+        and so are all if the law is taken for exact in its shape.
+        """
+        parameters = final.model.effect(cause.label).parameters
+        if not any(p.each for p in parameters):
+            return cause
+        shapes = {f'{cause.label}.{p.name}': p.leeway for p in parameters if p.leeway}
+        task = replace(final.task, bounds={**final.task.bounds, **shapes})
+        found = self._fit_to_all(replace(final, task=task))
+        if isinstance(found, str):
+            log.info('%s on all records: %s', cause.label, found)
+            return cause
+        names = [name for side in final.trials for name in side]
+        return replace(cause, events=events_in(found, names, cause.label))
 
     def _broken_off(self, nominal: Outcome) -> Diagnosis:
         """The best answer before the end, without any fit more."""

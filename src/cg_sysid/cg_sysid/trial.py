@@ -62,13 +62,16 @@ class Trial:
         """Inputs in the order that a model wants, shape (n, len(names)).
 
         `time` is the time of the recording, as warming and drift go on through all pieces of one,
-        and `session_time` that of the session; a switch that was not recorded (`drive_enabled`)
+        and `session_time` that of the session. Both are held from row to row like any input: at
+        the middle of that interval, or what happens at an instant would come half a sample late.
+        A switch that was not recorded (`drive_enabled`)
         counts as on.
         """
         if tuple(names) == self.input_names:
             return self.inputs
         recorded = dict(zip(self.input_names, self.inputs.T, strict=True))
-        time = self.since + self.time
+        held = np.diff(self.time)
+        time = self.since + self.time + np.append(held, held[-1]) / 2
         known = {TIME: time, SESSION_TIME: self.session + time, **recorded}
         ones = np.ones(len(self.time))
         return np.column_stack([known.get(name, ones) for name in names])

@@ -11,7 +11,14 @@ from cg_dynamics.parameter import Parameter
 class ExternalPush(StanceEffect):
     """A horizontal force at the hip, a pulse over the time of the record.
 
-    F(t) = impulse exp(-((t - instant) / duration)^2 / 2) / (sqrt(2 pi) duration)       (PUSH)
+    A rectangle whose edges are smeared by a logistic density, with s its scale and w its length:
+
+        F(t) = impulse (tanh((late + w/2) / 2s) - tanh((late - w/2) / 2s)) / 2w         (PUSH)
+        late = t - instant
+        s^2 = 3 roundness duration^2 / pi^2,  w^2 = 12 (1 - roundness) duration^2
+
+    The variances of the two add up, so that `duration` is the standard deviation of the pulse for
+    every `roundness`: a rectangle (0.1), a half sine (0.25), a bell (0.5) or a peak (0.9).
 
     A push is an event of a record, not a property of the machine: every record has its own
     impulse and instant, and most have none.
@@ -33,8 +40,12 @@ class ExternalPush(StanceEffect):
             starts=(0.5,), scale=0.005, each='record',
         ),
         Parameter(
-            'duration', 's', 'standard deviation of the pulse in time', 0.01, 2.0,
+            'duration', 's', 'standard deviation of the pulse in time', 0.002, 2.0,
             starts=(0.1,), scale=0.02, logarithmic=True,
+        ),
+        Parameter(
+            'roundness', '1', 'share of the squared duration that is in the edges', 0.1, 0.9,
+            starts=(0.5,), scale=0.1, free=False, leeway=0.4,
         ),
     )  # fmt: skip
     extra_inputs = (TIME,)
@@ -42,7 +53,10 @@ class ExternalPush(StanceEffect):
 
     def force(self, body, p):
         """(PUSH) through the hip's Jacobian."""
-        late = (p[TIME] - p['instant']) / p['duration']
-        pulse = ca.exp(-(late**2) / 2) / (math.sqrt(2 * math.pi) * p['duration'])
+        late, duration, round_ = p[TIME] - p['instant'], p['duration'], p['roundness']
+        edge = 2 * duration * ca.sqrt(3 * round_) / math.pi
+        length = duration * ca.sqrt(12 * (1 - round_))
+        rise, fall = (ca.tanh((late + half) / edge) for half in (length / 2, -length / 2))
+        pulse = (rise - fall) / (2 * length)
         hip, _ = body.hip()
         return ca.gradient(hip[0], body.q) * p['impulse'] * pulse
