@@ -395,8 +395,12 @@ class _Search:
         ]  # fmt: skip
 
     def _tie(self, contest: Contest, label: str) -> Contest | None:
-        """An effect and its rivals, fitted thoroughly: what is a tie then is one."""
-        close = [label, *(c.label for c in contest.close_to(label, COARSE_FIDELITY))]
+        """An effect and its rivals, fitted thoroughly: what is a tie then is one.
+
+        One that has the effect within it fits as well by itself, and is no rival.
+        """
+        rivals = (c.label for c in contest.close_to(label, COARSE_FIDELITY))
+        close = [label, *(rival for rival in rivals if not contains(rival, label))]
         ties = [pair[1] for name in close if (pair := contest.of(name)) and at_noise(pair[1])]
         if len(ties) < 2 or ties[0].label != label:
             return None
@@ -563,7 +567,8 @@ class _Search:
             if isinstance(lean, str):
                 log.info('without %s: %s', label, lean)
                 return None
-            self._contest(lean)
+            # Who would take the place has to come up to what is there.
+            self._contest(lean, final.train.normalised_error)
         contest = self.contests[key]
         # The fit beside the others may have been better, or the only one that went through.
         ranked = contest.of(label)
