@@ -856,7 +856,7 @@ class _Search:
             held=tuple(self.held),
             remaining=self._remaining(final),
             findings=(
-                *self._small_faults(final), *_outstanding(final),
+                *self._small_faults(final), *_shapes(final), *_outstanding(final),
                 *(self._own_judges() if causes else ()), *final.train.warnings,
             ),
             unmodelled=unmodelled,
@@ -900,6 +900,21 @@ def _small_faults(o: Outcome) -> list[str]:
                 found.append(
                     f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
                 )
+    return found
+
+
+def _shapes(o: Outcome) -> list[str]:
+    """Laws that have another shape than the model states, in words."""
+    found = []
+    for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True):
+        if u.name not in o.task.bounds or not o.model.declarations[u.name].leeway:
+            continue
+        off = abs(u.to_coordinate(v) - u.to_coordinate(u.prior))
+        if off > SHOWS * (s / v if u.logarithmic else s):
+            found.append(
+                f'{u.name} = {measured(v, s, u.unit)} and not {measured(u.prior, None, u.unit)}: '
+                'the shape of a law, which texts and machines draw differently'
+            )
     return found
 
 

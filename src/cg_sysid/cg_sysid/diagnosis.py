@@ -253,6 +253,11 @@ def summary_of(
     """
     if verdict == 'consistent':
         text = 'The model explains the records down to the noise of the sensors'
+        if max(g.before / g.after for g in gains) > NO_GAIN:
+            text += (
+                ', with what sound robots have besides: small faults and laws of another shape, '
+                'which the findings list and model.yaml holds'
+            )
         if strained:
             text += f', but with {", ".join(strained)} far from what its file believes'
         return f'{text}.'
