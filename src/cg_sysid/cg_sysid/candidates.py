@@ -518,7 +518,7 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
     own = next((e.parameters for e in o.model.effects if e.label == label), ())
     for p in own:
         chosen = o.model.values[f'{prefix}{p.name}']
-        if p.choice and chosen != p.starts[0]:
+        if p.choice and p.name not in shared and chosen != p.starts[0]:
             shared[p.name] = chosen, 0.0, p.unit
     events = events_of(o, label)
     fitted = [events[name] for name in o.trials[0] if name in events]

@@ -35,6 +35,7 @@ WINDOW = 2.5  # pieces
 LEARNING_S = 40.0  # windows to learn from, all together; what is beyond adds little
 LONGEST_WINDOW = 1.25  # s
 STOOD_IN = 0.5  # share of the error that causes or a term must take from what is without them
+NEARLY_ALL = 0.9  # of the squared error above the noise: a cause of another shape than its law's
 OF_USE = 0.3  # share of the fall of the log error that causes must have beside a term
 NEGLIGIBLE = 0.05  # chi2 per sample above the noise; less is not compared
 WORSE = 3.0  # times the error on windows that a fit of whole records may leave
@@ -80,7 +81,8 @@ def what_remains(
     """What a model with causes leaves, as a learned term, and whether the causes stand.
 
     An effect that the library lacks makes others look like it. If one learned term without the
-    causes is far better than the causes, and they are of no use beside it, they stood in for it.
+    causes is far better than the causes, and they are of no use beside it, they stood in for it;
+    unless the term is the law of a cause in another shape, and the cause takes nearly all of it.
 
     Args:
         nominal: The model without causes, fitted.
@@ -92,9 +94,23 @@ def what_remains(
     """
     beside = characterise(final, train, held, run)
     alone = characterise(nominal, train, held, run) if causes else None
-    if alone is None or _causes_stand(final, alone, beside or alone, (train, held)):
+    if (
+        alone is None
+        or _of_one_family(nominal, final, causes, alone)
+        or _causes_stand(final, alone, beside or alone, (train, held))
+    ):
         return beside, True
     return replace(alone, nearest=tuple(sorted(causes))), False
+
+
+def _of_one_family(
+    nominal: Outcome, final: Outcome, causes: Collection[str], term: Unmodelled
+) -> bool:
+    """Whether a cause is what the term is, drawn by another law."""
+    effects = [final.model.effect(label) for label in causes]
+    site = term.effect.site.partition(':')[0]
+    kin = any(e.family == term.effect.family and e.site in (site, 'all') for e in effects)
+    return kin and share_explained(nominal.held, final.held) > NEARLY_ALL
 
 
 def _causes_stand(final: Outcome, alone: Unmodelled, beside: Unmodelled, sides: Sides) -> bool:

@@ -42,7 +42,7 @@ from cg_sysid.candidates import (
     started_from,
     strained,
 )
-from cg_sysid.characterise import what_remains
+from cg_sysid.characterise import NEARLY_ALL, characterise, what_remains
 from cg_sysid.deadline import Deadline, OutOfTime
 from cg_sysid.diagnosis import (
     Candidate,
@@ -105,6 +105,7 @@ LEVEL = 1.0  # squared standard deviations within which two fits say the same of
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
+QUARTERS = (0.0, 1.57, 3.14, -1.57)  # rad, from one of which a wave is found
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
@@ -752,6 +753,10 @@ class _Search:
                 nominal, final, self._added(final), self.train, self.held, self.carry_out
             )
             final = final if stand else nominal
+            relative = None if stand and self._added(final) else self._relative(nominal, unmodelled)
+            if relative is not None:
+                final = relative
+                unmodelled = characterise(final, self.train, self.held, self.carry_out)
         final = self._less_mishaps(nominal, final)
         causes = self._causes(nominal, final)
         final = self._thorough(final)
@@ -764,6 +769,41 @@ class _Search:
         verdict = verdict_of(causes, bool(left), share)
         late = self._late_samples(self._gains(nominal, final)) if verdict == 'unexplained' else ''
         return self._answer(nominal, final, causes, verdict, unmodelled, wandering, late)
+
+    def _relative(self, nominal: Outcome, term: Unmodelled | None) -> Outcome | None:
+        """An effect of the library with the period of a learned term, if it takes nearly all.
+
+        How often a turn something repeats has many local minima; a learned term knows it.
+        """
+        if term is None or term.period is None:
+            return None
+        cycles, size = 2 * np.pi / term.period[0], float(np.ptp(term.shape.value) / 2)
+        tasks = []
+        for name, kind in LIBRARY.items():
+            if kind.family != term.effect.family or kind.wave is None:
+                continue
+            if all(p.name != 'cycles' for p in kind.parameters):
+                continue
+            at = kind(self.nominal.mechanism, term.effect.site).at
+            for turn in QUARTERS:
+                wave = dict(zip(kind.wave, (size, turn), strict=True))
+                model = nominal.task.model.with_effect(name, at, cycles=cycles, **wave)
+                known = replace(term.fit, motions=nominal.train.motions, own=nominal.train.own)
+                start = started_from(known, model, nominal.task.bounds)
+                tasks.append(Task(model, bounds=nominal.task.bounds, leads=(start,)))
+        found = self.race.fit(tasks, f'{term.label}, as effects of the library')
+        outcomes = [
+            replace(o, label=o.model.effects[-1].label) for o in found if isinstance(o, Outcome)
+        ]
+        if not outcomes:
+            return None
+        contest = self.jury.contest(nominal, [min(outcomes, key=chi2)])
+        winner = contest.winner()
+        if winner is None or share_explained(nominal.held, winner[1].held) < NEARLY_ALL:
+            return None
+        self.contests[frozenset(), bool(nominal.task.bounds)] = contest
+        self._note(contest, winner[0].label)
+        return winner[1]
 
     def _with_events(self, final: Outcome, cause: Cause) -> Cause:
         """The cause with what every record has of its own by a fit to all records.

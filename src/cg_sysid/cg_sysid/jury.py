@@ -42,6 +42,7 @@ AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
 SHORTEST_BLOCK_S = 0.1
+HALVED = 0.5  # of the squared error above the noise; who takes more of it is surely there
 MISHAP = 1 / 3  # of the error above the noise: what single mishaps leave at most, if they are it
 SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
@@ -193,7 +194,10 @@ class Jury:
             reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
                            f'{100 * MISHAP:.0f} % allowed')
         own = own_parameters(o)
-        reasons += at_edge(o) + too_small(o) + undetermined_size(o)
+        reasons += at_edge(o)
+        # What takes most of the error acts, though its numbers may be known together only.
+        if left > HALVED or not _known_at_all(o):
+            reasons += too_small(o) + undetermined_size(o)
         reasons += as_sound_robots(o.label, own)
         return Candidate(
             label=o.label,
@@ -233,6 +237,12 @@ def share_explained(before: Fit, after: Fit) -> float:
     """Share of the squared error above the noise that is gone, 0 to 1."""
     gone = before.normalised_error - after.normalised_error
     return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
+
+
+def _known_at_all(o: Outcome) -> bool:
+    """Whether the size of an effect is more than its own standard deviation."""
+    size, sigma, _ = next(iter(own_parameters(o).values()), (0.0, np.inf, ''))
+    return abs(size) > sigma
 
 
 def above_noise(o: Outcome) -> float:

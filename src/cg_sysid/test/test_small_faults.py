@@ -97,7 +97,7 @@ def test_a_cause_is_named_among_small_faults(nominal, effect, values):
 def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
     """Together they come to the noise, and no cause without them does."""
     machine = nominal.with_effect('actuator_delay', delay=0.001)
-    found = diagnose(nominal, _records(machine.with_effect('torque_bias', bias=0.03)),
+    found = diagnose(nominal, _records(machine.with_effect('torque_bias', bias=0.06)),
                      Options(effects=EFFECTS, workers=1))  # fmt: skip
     assert [(cause.label, cause.rivals) for cause in found.causes] == [('torque_bias', ())]
     value, sigma, _ = found.causes[0].parameters['bias']
@@ -111,7 +111,7 @@ def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
 @pytest.mark.slow
 def test_what_hides_behind_small_faults_and_is_small_itself_is_no_cause(nominal):
     machine = nominal.with_effect('actuator_delay', delay=0.001)
-    machine = machine.with_effect('quadratic_friction', coefficient=0.006)
+    machine = machine.with_effect('quadratic_friction', coefficient=0.008)
     found = diagnose(nominal, _records(machine, 5.0), Options(effects=EFFECTS, workers=1))
     # Nor is the delay, or a lag that looks like it: that small it is a small fault.
     assert (found.verdict, found.causes) == ('consistent', ())

@@ -11,6 +11,7 @@ class AerodynamicDrag(Effect):
 
     name = 'aerodynamic_drag'
     place = 'environment'
+    family = ('outer_torque', 'rate')
     summary = (
         'Air resists each leg with the square of its own rate in the world: -coefficient w |w|.'
     )

@@ -10,6 +10,7 @@ class AnkleFriction(StanceEffect):
     """-coefficient dq_st/dt on the leg that stands, by its rate against the ground."""
 
     name = 'ankle_friction'
+    family = ('outer_torque', 'rate')
     friction = 'viscous'
     summary = (
         'The foot that stands resists turning on the ground: -coefficient times the rate of that '

@@ -15,6 +15,7 @@ class AsymmetricFriction(Effect):
 
     name = 'asymmetric_friction'
     place = 'joint'
+    family = ('joint_torque', 'rate')
     friction = 'dry'
     summary = (
         'Dry friction is higher one way than the other: '

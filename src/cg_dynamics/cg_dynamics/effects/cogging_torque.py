@@ -11,6 +11,7 @@ class CoggingTorque(Effect):
 
     name = 'cogging_torque'
     place = 'transmission'
+    family = ('joint_torque', 'angle')
     ripple = True
     summary = (
         'Magnets or teeth pull the joint to certain angles: a torque '

@@ -27,6 +27,7 @@ class CoulombFriction(Effect):
 
     name = 'coulomb_friction'
     place = 'joint'
+    family = ('joint_torque', 'rate')
     friction = 'dry'
     summary = 'Dry friction, smoothed: -torque tanh(rate / transition_rate) (Eq. 4.12).'
     parameters = (

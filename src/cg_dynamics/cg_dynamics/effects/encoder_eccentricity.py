@@ -10,6 +10,7 @@ class EncoderEccentricity(SensorEffect):
     """y = angle + amplitude sin(angle + phase)."""
 
     name = 'encoder_eccentricity'
+    family = ('angle_error', 'angle')
     kind = 'encoder'
     summary = (
         'The disc of the encoder is off centre, an error that repeats once per revolution: '

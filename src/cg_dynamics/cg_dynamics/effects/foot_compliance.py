@@ -8,6 +8,7 @@ class FootCompliance(StanceEffect):
     """V = stiffness q_st^2 / 2, q_st the lean of the leg that stands."""
 
     name = 'foot_compliance'
+    family = ('outer_torque', 'angle')
     summary = (
         'A soft pad under the foot that stands holds the leg upright: -stiffness lean. '
         'How far it sinks in under the weight is left out.'

@@ -16,6 +16,7 @@ class FrictionDrift(Effect):
 
     name = 'friction_drift'
     place = 'joint'
+    family = ('joint_friction', 'time')
     friction = 'dry'
     summary = (
         'Grease warms up: dry friction starts off by an excess that fades with the time of the '

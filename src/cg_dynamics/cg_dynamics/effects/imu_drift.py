@@ -8,6 +8,7 @@ class ImuDrift(SensorEffect):
     """y = angle + rate time, time from the start of the record."""
 
     name = 'imu_drift'
+    family = ('angle_error', 'time')
     kind = 'inclinometer'
     summary = (
         'The lean angle of the IMU drifts with the time of the record: y = angle + rate time.'

@@ -12,6 +12,7 @@ class LoadDependentFriction(Effect):
 
     name = 'load_dependent_friction'
     place = 'joint'
+    family = ('joint_friction', 'torque')
     friction = 'dry'
     summary = (
         'Teeth rub with the load they carry: -coefficient |load| tanh(rate / transition_rate), '

@@ -14,6 +14,7 @@ class PositionDependentFriction(Effect):
 
     name = 'position_dependent_friction'
     place = 'joint'
+    family = ('joint_friction', 'angle')
     friction = 'dry'
     summary = (
         'A bearing or gear that runs out of true rubs most at one angle: '
@@ -24,15 +25,15 @@ class PositionDependentFriction(Effect):
     parameters = (
         Parameter(
             'torque', 'N m', 'extra dry friction where it is tightest', 0.0, 50.0,
-            neutral=0.0, starts=(0.05, 1.0), scale=0.05,
+            neutral=0.0, starts=(0.5,), scale=0.05,
         ),
         Parameter(
             'tightest', 'rad', 'joint angle of most friction, times cycles', -9.5, 9.5,
-            starts=(1.5, -1.5, 0.0), scale=0.1, along='rad',
+            starts=(0.0, 2.1, -2.1), scale=0.1, along='rad',
         ),
         Parameter(
-            'cycles', '1', 'tight places in one turn', 0.2, 10.0,
-            starts=(1.0,), scale=0.1, free=False, logarithmic=True, leeway=log(2.5),
+            'cycles', '1', 'tight places in one turn', 0.2, 40.0,
+            starts=(1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0), scale=0.1, free=False, logarithmic=True, leeway=log(2.5),
             along='rad/m',
         ),
         TRANSITION_RATE,

@@ -11,6 +11,7 @@ class QuadraticFriction(Effect):
 
     name = 'quadratic_friction'
     place = 'joint'
+    family = ('joint_torque', 'rate')
     friction = 'viscous'
     summary = 'Friction that grows with the square of the rate: -coefficient rate |rate|.'
     parameters = (

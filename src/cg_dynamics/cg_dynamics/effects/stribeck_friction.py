@@ -20,6 +20,7 @@ class StribeckFriction(Effect):
 
     name = 'stribeck_friction'
     place = 'joint'
+    family = ('joint_torque', 'rate')
     friction = 'dry'
     summary = (
         'Dry friction that is higher near standstill and fades with rate: '

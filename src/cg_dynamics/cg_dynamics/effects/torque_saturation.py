@@ -21,6 +21,7 @@ class TorqueSaturation(Effect):
 
     name = 'torque_saturation'
     place = 'command'
+    family = ('joint_torque', 'torque')
     summary = (
         'The motor delivers no more than its limit: tau_motor = tau, cut off at +-limit, with a '
         'round knee if it has roundness.'

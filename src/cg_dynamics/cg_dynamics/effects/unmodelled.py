@@ -316,6 +316,7 @@ def _define() -> dict[str, type[LearnedEffect]]:
                     'name': name,
                     'summary': summary,
                     'variable': variable,
+                    'family': (what, variable),
                     'unit': unit,
                     'kind': kind,
                     'coefficients': _coefficients(kind),

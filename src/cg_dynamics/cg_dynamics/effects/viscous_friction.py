@@ -9,6 +9,7 @@ class ViscousFriction(Effect):
 
     name = 'viscous_friction'
     place = 'joint'
+    family = ('joint_torque', 'rate')
     friction = 'viscous'
     summary = 'Friction proportional to the joint rate: -coefficient rate (Eq. 4.12).'
     parameters = (
