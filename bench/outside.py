@@ -23,7 +23,8 @@ foreign_laws.RIGHT has for that law. pair: the causes are the two, and no third.
 unlisted: no cause, or those that are named are not all (`unexplained`).
 
 Every case is one line of --raw, with the version of the sources that made it; a case that is
-there in this version is not run again. Cases that fail, or have no answer within --limit, count as wrong.
+there in this version is not run again. Cases that fail, or have no answer within --limit, count
+as wrong.
 """
 
 import argparse

@@ -753,7 +753,9 @@ class _Search:
                 nominal, final, self._added(final), self.train, self.held, self.carry_out
             )
             final = final if stand else nominal
-            relative = None if stand and self._added(final) else self._relative(nominal, unmodelled)
+            relative = None
+            if not self._added(final):
+                relative = self._relative(nominal, unmodelled)
             if relative is not None:
                 final = relative
                 unmodelled = characterise(final, self.train, self.held, self.carry_out)

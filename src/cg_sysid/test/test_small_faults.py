@@ -101,7 +101,7 @@ def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
                      Options(effects=EFFECTS, workers=1))  # fmt: skip
     assert [(cause.label, cause.rivals) for cause in found.causes] == [('torque_bias', ())]
     value, sigma, _ = found.causes[0].parameters['bias']
-    assert abs(value - 0.03) < 4 * sigma < 0.01
+    assert abs(value - 0.06) < 4 * sigma < 0.01
     # What is left of the small faults is what was there.
     identified = found.extended.train.model.values
     assert identified['actuator_delay.delay'] == pytest.approx(0.001, rel=0.05)

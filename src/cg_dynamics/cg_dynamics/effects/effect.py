@@ -126,8 +126,8 @@ class Effect:
         friction: How it opposes motion: 'dry' where the level does not fade with the rate, so that
             the slope at standstill is only that of its smoothing; 'viscous' where it does; empty
             where it does not.
-        family: (what, variable) of the learned terms (unmodelled.py) that have this law among their
-            functions; empty where it is more than a function of one variable.
+        family: (what, variable) of the learned terms (unmodelled.py) that have this law among
+            their functions; empty where it is more than a function of one variable.
         ripple: True where its slope changes sign within small motions, so that the slope at one
             state tells nothing of those around it.
         at: Joint, body or sensor where this instance acts; None where there is only one.

@@ -33,8 +33,8 @@ class PositionDependentFriction(Effect):
         ),
         Parameter(
             'cycles', '1', 'tight places in one turn', 0.2, 40.0,
-            starts=(1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0), scale=0.1, free=False, logarithmic=True, leeway=log(2.5),
-            along='rad/m',
+            starts=(1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0), scale=0.1, free=False,
+            logarithmic=True, leeway=log(2.5), along='rad/m',
         ),
         TRANSITION_RATE,
     )  # fmt: skip
