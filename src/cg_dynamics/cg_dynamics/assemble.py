@@ -27,7 +27,8 @@ class Equations:
         p: Parameters, shape (np, 1).
         rates: dx/dt.
         outputs: What the sensors report, before any delay, shape (ny, 1).
-        initial: x at the start, given (s, ds/dt) in the first entries of x and the held u.
+        initial: x at the start, given (s, ds/dt) in the first entries of x and the held u. The
+            others say how far extra states are from settled, in their `start_spreads`.
         input_delay: Delay of the inputs in s.
         output_delays: Delay of each output in s, shape (ny, 1).
         mass_matrix: Of the free coordinates.
@@ -195,14 +196,13 @@ def assemble(model: Model, setup: Setup) -> Equations:
             late = e.output_delay(channel, own[e.label])
             output_delays[channel] += 0 if late is None else late
     rates = [dz[e.label] for e in effects if e.states]
-    initial = [starts[e.label] for e in effects if e.states]
     return Equations(
         x=x,
         u=u,
         p=p,
         rates=ca.vertcat(ds, acceleration, *(r for group in rates for r in group)),
         outputs=ca.vertcat(*outputs.values()),
-        initial=ca.vertcat(s, ds, *(r for group in initial for r in group)),
+        initial=ca.vertcat(s, ds, *_start(effects, starts, z_of, own)),
         input_delay=input_delay,
         output_delays=ca.vertcat(*output_delays.values()),
         mass_matrix=mass_matrix,
@@ -223,6 +223,39 @@ def assemble(model: Model, setup: Setup) -> Equations:
         ),
         largest_step=min((e.largest_step for e in effects), default=float('inf')),
     )
+
+
+def _start(
+    effects: Sequence[Effect],
+    starts: Mapping[str, list[ca.SX]],
+    states: Mapping[str, list[ca.SX]],
+    own: Mapping[str, Mapping[str, ca.SX]],
+) -> list[ca.SX]:
+    """Extra states at the start, in the order of the effects.
+
+    Args:
+        effects: Those that act.
+        starts: Label -> settled states, in the order along the torque path and to the sensors: of
+            symbols of the motion and of states before them.
+        states: Label -> their symbols, which say here how far they are from settled.
+        own: Label -> its parameters.
+    """
+    by_label = {e.label: e for e in effects}
+    before: list[ca.SX] = []
+    at_start: list[ca.SX] = []
+    found = {}
+    for label, settled in starts.items():
+        # What comes before starts first: a spring is wound up by the lagging torque's start.
+        if before:
+            settled = ca.substitute(settled, before, at_start)
+        spreads = by_label[label].start_spreads(own[label])
+        found[label] = [
+            start + spread * away
+            for start, spread, away in zip(settled, spreads, states[label], strict=True)
+        ]
+        before += states[label]
+        at_start += found[label]
+    return [start for e in effects if e.states for start in found[e.label]]
 
 
 def divides(effect: Effect) -> bool:

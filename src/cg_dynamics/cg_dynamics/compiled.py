@@ -113,24 +113,25 @@ class CompiledModel:
         return float(values[0]), values[1:], np.asarray(jacobian)
 
     def initial_state(self, motion: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Full state at the start, extra states settled: shape (nx,).
+        """Full state at the start: shape (nx,).
 
         Args:
-            motion: Free coordinates and their rates, shape (2 m,).
+            motion: Free coordinates and their rates, shape (2 m,), extra states settled; or
+                (nx,), how far these are from that behind, in their spreads (`start_spreads`).
             u: Inputs held at the start, shape (nu,).
             p: Parameter vector.
         """
         return self.initial_sensitivity(motion, u, p)[0]
 
     def initial_sensitivity(self, motion, u, p) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `initial_state`, with d/d(motion) (nx, 2m) and d/d(free) (nx, nf)."""
+        """As `initial_state`, with d/d(motion), shape of motion, and d/d(free) (nx, nf)."""
         m2 = 2 * self.equations.coordinates
         if self.nx == m2:
             return np.array(motion, float), np.eye(m2), np.zeros((m2, len(self.free)))
         x = np.zeros(self.nx)
-        x[:m2] = motion
+        x[: len(motion)] = motion
         full, by_x, by_p = self._initial(x, u, p)
-        return np.asarray(full).ravel(), np.asarray(by_x)[:, :m2], np.asarray(by_p)
+        return np.asarray(full).ravel(), np.asarray(by_x)[:, : len(motion)], np.asarray(by_p)
 
     def step_for(self, x0: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:
         """Longest of equal integration steps in s at which this motion is simulated well.

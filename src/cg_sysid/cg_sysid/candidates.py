@@ -17,7 +17,7 @@ from cg_sysid.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.imperfections import Bounds, turning
 from cg_sysid.text import measured
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, own_unknowns
+from cg_sysid.unknowns import IdentificationError, own_unknowns, unsettled_states
 
 SCREEN_ITERATIONS = 16
 ITERATIONS = 60
@@ -289,13 +289,25 @@ def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
     known = {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)}
     unknowns = unknowns_of(model, bounds=bounds)
     own = own_unknowns(model)
+    before = unsettled_states(found.model)
     motions = []
     for motion in found.motions:
         first = len(motion) - len(found.own)
         known_own = {u.name: v for u, v in zip(found.own, motion[first:], strict=True)}
-        motions.append(np.array([*motion[:first], *(known_own.get(u.name, u.prior) for u in own)]))
+        moving = first - len(before)
+        away = dict(zip(before, motion[moving:first], strict=True))
+        motions.append(
+            np.array([
+                *motion[:moving],
+                *(away.get(state, 0.0) for state in unsettled_states(model)),
+                *(known_own.get(u.name, u.prior) for u in own),
+            ])
+        )  # fmt: skip
     values = np.array([np.clip(known.get(u.name, u.prior), u.lower, u.upper) for u in unknowns])
-    return replace(found, unknowns=unknowns, values=values, own=own, motions=tuple(motions))
+    return replace(
+        found, model=_chosen(model, found), unknowns=unknowns, values=values, own=own,
+        motions=tuple(motions),
+    )  # fmt: skip
 
 
 def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:

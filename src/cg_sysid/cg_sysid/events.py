@@ -16,7 +16,7 @@ from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.identify import Fit, fit, score
+from cg_sysid.identify import Fit, fit, in_trial, score
 from cg_sysid.imperfections import Bounds
 from cg_sysid.trial import Trial, pieces
 from cg_sysid.unknowns import IdentificationError, awake, own_unknowns
@@ -125,7 +125,7 @@ class _Seeking:
         quiet = self._fit(trial, nothing, 8)
         guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
         found = quiet.own_by_name([trial])[trial.name]
-        motion = quiet.motions[0][: -len(quiet.own)]
+        _, motion = in_trial(awake(self.model), quiet.motions[0])
         others = {name: value for name, value in found.items() if name not in self.names}
         starts = _small_events(self.model.with_values(others), trial, motion, self.names)
         return self.follow(trial, guess, starts)

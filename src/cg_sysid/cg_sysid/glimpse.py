@@ -12,6 +12,7 @@ import numpy as np
 
 from cg_sysid.identify import Fit
 from cg_sysid.trial import Trial
+from cg_sysid.unknowns import unsettled_states
 
 LENGTHS_S = (2.0, 5.0)  # of long records: the first of them in which the base fails
 ENOUGH_S = 10.0  # of short records
@@ -57,6 +58,7 @@ def to_all(found: Fit, trials: Sequence[Trial]) -> Fit:
     if len(found.motions) == len(trials):
         return found
     count = len(found.own)
+    settled = np.zeros(len(unsettled_states(found.model)))
     priors = np.array([u.prior for u in found.own])
     common = np.array([u.each == 'recording' for u in found.own], bool)
     known = dict(zip(few(trials), found.motions, strict=True))
@@ -64,7 +66,8 @@ def to_all(found: Fit, trials: Sequence[Trial]) -> Fit:
                     for i, motion in known.items()}  # fmt: skip
     return replace(found, motions=tuple(
         known[i] if i in known else np.array([
-            *trial.motion, *np.where(common, of_recording.get(trial.recording, priors), priors)
+            *trial.motion, *settled,
+            *np.where(common, of_recording.get(trial.recording, priors), priors),
         ])
         for i, trial in enumerate(trials)
     ))  # fmt: skip

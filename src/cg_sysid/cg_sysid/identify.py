@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.assemble import acting_effects, parameter_vector
 from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_sysid import kept_fits
@@ -29,7 +29,13 @@ from cg_sysid.simulation_error import BARRIER, Point, Problem, evaluate, moved, 
 from cg_sysid.text import off_by
 from cg_sysid.trial import Trial
 from cg_sysid.uncertainty import uncertainty
-from cg_sysid.unknowns import IdentificationError, Unknown, own_unknowns, unknowns_of
+from cg_sysid.unknowns import (
+    IdentificationError,
+    Unknown,
+    own_unknowns,
+    unknowns_of,
+    unsettled_states,
+)
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
@@ -125,8 +131,9 @@ class Fit:
         covariance: Of the unknowns' coordinates (log where logarithmic), shape (k, k).
         information: Share of each unknown's certainty that comes from data, 0 (all from the
             model file's belief) to 1.
-        motions: What each trial has of its own: initial motion, (2m,), then one value for each
-            of `own`.
+        motions: What each trial has of its own: initial motion, (2m,), how far extra states are
+            from settled at its start (`unsettled_states`, in their spreads), then one value for
+            each of `own`.
         own: Parameters of which every record has a value of its own (a push's instant).
         own_sigmas: Standard deviation of these, shape (len(own),) for each trial.
         cost: Final cost J, in squared noise standard deviations.
@@ -359,8 +366,14 @@ def _guesses(
     model: Model, trials: Sequence[Trial], own: Mapping[str, Mapping[str, float]]
 ) -> list[np.ndarray]:
     stated = {u.name: u.prior for u in own_unknowns(model)}
+    settled = [0.0] * len(unsettled_states(model))
     return [
-        np.array([*trial.motion, *(own.get(trial.name, {}).get(n, v) for n, v in stated.items())])
+        np.array(
+            [
+                *trial.motion, *settled,
+                *(own.get(trial.name, {}).get(n, v) for n, v in stated.items()),
+            ]
+        )
         for trial in trials
     ]
 
@@ -571,10 +584,18 @@ def _warnings(fit: Fit, bounds: Collection[str]):
 
 
 def in_trial(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
-    """The model with what a trial has of its own (Fit.motions), and its initial motion, (2m,)."""
+    """The model with what a trial has of its own (Fit.motions), and its start, (nx,).
+
+    The start is as `CompiledModel.initial_state` takes it.
+    """
     unknowns = own_unknowns(model)
     happened = dict(zip((u.name for u in unknowns), own_values(unknowns, own), strict=True))
-    return model.with_values(happened), own[: len(own) - len(unknowns)]
+    model = model.with_values(happened)
+    start = own[: len(own) - len(unknowns)]
+    states = unsettled_states(model)
+    acting = {f'{e.label}.{s}' for e in acting_effects(model) for s in e.states}
+    taken = [True] * (len(start) - len(states)) + [name in acting for name in states]
+    return model, start[np.array(taken, bool)]
 
 
 def predict(

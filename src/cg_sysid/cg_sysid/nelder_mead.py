@@ -20,7 +20,12 @@ from cg_sysid.identify import Fit, Progress, score
 from cg_sysid.simulation_error import Problem
 from cg_sysid.text import off_by
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import IdentificationError, own_unknowns, unknowns_of
+from cg_sysid.unknowns import (
+    IdentificationError,
+    own_unknowns,
+    unknowns_of,
+    unsettled_states,
+)
 
 EVALUATIONS_PER_UNKNOWN = 200  # the limit of fminsearch
 TOLERANCE = 1e-4  # of fminsearch: on the simplex, relative to each start, and on the cost
@@ -115,7 +120,8 @@ def _motions(model: Model, trials: Sequence[Trial]) -> list[np.ndarray]:
     try:
         return list(score(model, trials).motions)
     except IdentificationError:
-        return [trial.motion for trial in trials]
+        settled = np.zeros(len(unsettled_states(model)))
+        return [np.concatenate([trial.motion, settled]) for trial in trials]
 
 
 def _search(cost: '_Cost', start: np.ndarray, evaluations: int) -> 'scipy.optimize.OptimizeResult':
@@ -176,7 +182,7 @@ class _Cost:
         for i, trial in enumerate(problem.trials):
             compiled, p = problem.compiled[i], problem.vectors[i]
             p[problem.places[i]] = values
-            x0 = compiled.initial_state(self.motions[i], trial.inputs[0], p)
+            x0 = compiled.initial_state(self.motions[i][problem.starts[i]], trial.inputs[0], p)
             no_columns = np.zeros((compiled.nx, 0))
             unmoved = np.full(len(compiled.free), -1)
             normal, _, _ = compiled.normal(

@@ -200,7 +200,7 @@ class _Linear:
         x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)
         known = [name for name in names if name in compiled.free]
         s0 = np.zeros((nx, 2 * m + len(names)))
-        s0[:, : 2 * m] = by_motion
+        s0[:, : 2 * m] = by_motion[:, : 2 * m]
         column = np.full(len(compiled.free), -1)
         for name in known:
             column[compiled.free.index(name)] = 2 * m + names.index(name)

@@ -17,7 +17,7 @@ from cg_dynamics.compiled import CompiledModel, Normal, compile_model
 from cg_dynamics.model import Model
 from cg_sysid.parallel import side_by_side
 from cg_sysid.trial import Trial
-from cg_sysid.unknowns import Unknown, awake, own_unknowns
+from cg_sysid.unknowns import Unknown, awake, own_unknowns, unsettled_states
 
 RUNAWAY = 1e60
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
@@ -27,7 +27,8 @@ BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one sq
 class Problem:
     """Compiled models and constants of one fit.
 
-    What a trial has of its own is one vector: its initial motion, then the values of
+    What a trial has of its own is one vector: its initial motion, how far extra states are from
+    settled at its start (`unsettled_states`, in their spreads), then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
     place of one.
@@ -45,6 +46,7 @@ class Problem:
     vectors: list[np.ndarray] = field(default_factory=list)
     places: list[np.ndarray] = field(default_factory=list)
     own_places: list[np.ndarray] = field(default_factory=list)
+    starts: list[np.ndarray] = field(default_factory=list)
     columns: list[np.ndarray] = field(default_factory=list)
     inputs: list[np.ndarray] = field(default_factory=list)
     evaluations: int = 0
@@ -52,16 +54,21 @@ class Problem:
     def __post_init__(self):
         names = tuple(u.name for u in self.unknowns)
         self.own = own_unknowns(self.model)
+        unsettled = unsettled_states(self.model)
         own = [u.name for u in self.own]
         default = compile_free(self.model, names)
         model = awake(self.model)
         for trial in self.trials:
             compiled = compile_model(model, trial.setup, default)
             m2 = 2 * compiled.equations.coordinates
-            order = [*own, *names]
+            order = [*unsettled, *own, *names]
             self.spreads.append(
-                np.concatenate([trial.motion_sigma, [u.tolerance for u in self.own]])
+                np.concatenate(
+                    [trial.motion_sigma, np.ones(len(unsettled)), [u.tolerance for u in self.own]]
+                )
             )
+            at = [m2 + unsettled.index(s) for s in compiled.state_names[m2:]]
+            self.starts.append(np.concatenate([np.arange(m2), at]).astype(int))
             self.own_places.append(
                 np.array([compiled.parameter_names.index(n) for n in own], int)
             )
@@ -73,7 +80,7 @@ class Problem:
                 np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)
             )
         self.consistency = _consistency(self.model, names)
-        self.blocks = _blocks(self.trials, self.own)
+        self.blocks = _blocks(self.trials, self.own, len(unsettled))
         shared = np.array([u.each == 'recording' for u in self.own], bool)
         for block in self.blocks:
             for i in block.trials[1:]:
@@ -87,7 +94,7 @@ class Problem:
         is wrong starts as far from where the machine did as it goes on.
         """
         scale = np.ones(len(self.spreads[i]))
-        scale[: len(scale) - len(self.own)] /= np.sqrt(weight)
+        scale[: len(self.trials[i].motion)] /= np.sqrt(weight)
         return self.spreads[i] * scale
 
     def values(self, theta: np.ndarray) -> np.ndarray:
@@ -116,7 +123,9 @@ class Block:
     size: int
 
 
-def _blocks(trials: Sequence[Trial], own: Sequence[Unknown]) -> tuple[Block, ...]:
+def _blocks(
+    trials: Sequence[Trial], own: Sequence[Unknown], unsettled: int
+) -> tuple[Block, ...]:
     """Each trial alone or, where something belongs to a recording, with the others of that."""
     shared = np.array([u.each == 'recording' for u in own], bool)
     together: dict[str, list[int]] = {}
@@ -126,11 +135,11 @@ def _blocks(trials: Sequence[Trial], own: Sequence[Unknown]) -> tuple[Block, ...
     for members in together.values():
         places, size = [], int(shared.sum())
         for i in members:
-            m2 = len(trials[i].motion)
-            alone = m2 + int((~shared).sum())
-            place = np.empty(m2 + len(own), int)
-            place[np.concatenate([np.ones(m2, bool), ~shared])] = size + np.arange(alone)
-            place[np.concatenate([np.zeros(m2, bool), shared])] = np.arange(shared.sum())
+            first = len(trials[i].motion) + unsettled
+            alone = first + int((~shared).sum())
+            place = np.empty(first + len(own), int)
+            place[np.concatenate([np.ones(first, bool), ~shared])] = size + np.arange(alone)
+            place[np.concatenate([np.zeros(first, bool), shared])] = np.arange(shared.sum())
             places.append(place)
             size += alone
         blocks.append(Block(tuple(members), tuple(places), size))
@@ -282,12 +291,12 @@ def simulate_sensitive(
     trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
     p = problem.vectors[i].copy()
     p[problem.places[i]] = values
-    m2 = len(motion) - len(problem.own)
     p[problem.own_places[i]] = own_values(problem.own, motion)
     n = int(np.searchsorted(trial.time, horizon, side='right'))
-    x0, by_motion, by_free = compiled.initial_sensitivity(motion[:m2], u[0], p)
+    start = problem.starts[i]
+    x0, by_start, by_free = compiled.initial_sensitivity(motion[start], u[0], p)
     s0 = np.zeros((compiled.nx, len(motion) + len(values)))
-    s0[:, :m2] = by_motion
+    s0[:, start] = by_start
     for f, column in enumerate(problem.columns[i]):
         if column >= 0:
             s0[:, column] = by_free[:, f]

@@ -124,6 +124,14 @@ def own_unknowns(model: Model) -> tuple[Unknown, ...]:
     )  # fmt: skip
 
 
+def unsettled_states(model: Model) -> tuple[str, ...]:
+    """Extra states of which every record has a start of its own, as none need have settled.
+
+    Those of effects that happen not to act are among them.
+    """
+    return tuple(f'{effect.label}.{state}' for effect in model.effects for state in effect.states)
+
+
 def awake(model: Model) -> Model:
     """The model with a little of what every record has of its own.
 

@@ -1,6 +1,6 @@
 """First-order lag of the motor's torque."""
 
-from cg_dynamics.effects.effect import Effect
+from cg_dynamics.effects.effect import START_TORQUE, Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -28,3 +28,7 @@ class ActuatorLag(Effect):
     def initial_states(self, angle, rate, torque, p):
         """Settled at the torque that is held at the start."""
         return [torque]
+
+    def start_spreads(self, p):
+        """Commands of a moment before may still be on."""
+        return [START_TORQUE]

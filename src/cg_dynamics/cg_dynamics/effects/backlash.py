@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from cg_dynamics.effects.effect import Effect
+from cg_dynamics.effects.effect import START_TORQUE, Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -69,3 +69,8 @@ class Backlash(Effect):
         """On the flank that the held torque presses on, moving with the joint."""
         side = ca.tanh(torque / 0.1)
         return [angle + side * p['gap'] / 2 + torque / p['stiffness'], rate]
+
+    def start_spreads(self, p):
+        """On that flank still: wound up by START_TORQUE more or less, in energy as in motion."""
+        natural = ca.sqrt(p['stiffness'] * p['rotor_inertia'])
+        return [START_TORQUE / p['stiffness'], START_TORQUE / natural]

@@ -28,6 +28,9 @@ from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 
 Symbols = Mapping[str, ca.SX]
+# N m (N where a joint slides); what a joint of a robot that walks transmits beyond its held torque
+# as a record begins: that which speeds up its rotor, and that which was applied a moment before.
+START_TORQUE = 5.0
 SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
 # Extra inputs that are clocks, in s: since the start of the recording, and since that of the first
 # recording of its session.
@@ -269,6 +272,13 @@ class Effect:
 
     def initial_states(self, angle: ca.SX, rate: ca.SX, torque: ca.SX, p: Symbols) -> list[ca.SX]:
         """Extra states at the start of a record, from joint angle, rate and held torque."""
+        return [ca.SX(0) for _ in self.states]
+
+    def start_spreads(self, p: Symbols) -> list[ca.SX]:
+        """How far each extra state may lie from its start, one standard deviation.
+
+        A record may begin in motion, and what no sensor reads need not have settled by then.
+        """
         return [ca.SX(0) for _ in self.states]
 
     def initial_readings(self, outputs: dict[str, ca.SX], p: Symbols) -> list[ca.SX]:

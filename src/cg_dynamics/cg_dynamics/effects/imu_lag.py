@@ -3,6 +3,8 @@
 from cg_dynamics.effects.effect import ImuEffect
 from cg_dynamics.parameter import Parameter
 
+LIVELY = 10.0  # rad/s^2; of a leg of half a metre to a metre that gravity turns
+
 
 class ImuLag(ImuEffect):
     """T dy/dt = value - y, for lean angle and rate alike."""
@@ -30,3 +32,7 @@ class ImuLag(ImuEffect):
         """Behind by T times the rate, as after a while at that rate."""
         angle, rate = (outputs[channel] for channel in self.channels)
         return [angle - p['time_constant'] * rate, rate]
+
+    def start_spreads(self, p):
+        """Behind by what an acceleration of LIVELY makes of rate and angle."""
+        return [LIVELY * p['time_constant'] ** 2, LIVELY * p['time_constant']]

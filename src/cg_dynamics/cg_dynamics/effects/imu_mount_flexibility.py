@@ -1,6 +1,6 @@
 """An IMU on a part that bends when the motor pulls."""
 
-from cg_dynamics.effects.effect import ImuEffect
+from cg_dynamics.effects.effect import START_TORQUE, ImuEffect
 from cg_dynamics.parameter import Parameter
 
 
@@ -49,3 +49,8 @@ class ImuMountFlexibility(ImuEffect):
     def initial_readings(self, outputs, p):
         """Bent by the torque that is held at the start."""
         return [p['compliance'] * p['hip_torque'], 0]
+
+    def start_spreads(self, p):
+        """Bent by START_TORQUE more or less, and as much energy in its motion."""
+        bend = START_TORQUE * p['compliance']
+        return [bend, bend * p['frequency']]

@@ -2,7 +2,9 @@
 
 from typing import ClassVar
 
-from cg_dynamics.effects.effect import Effect
+import casadi as ca
+
+from cg_dynamics.effects.effect import START_TORQUE, Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -51,3 +53,8 @@ class JointFlexibility(Effect):
     def initial_states(self, angle, rate, torque, p):
         """Wound up by the held torque, moving with the joint."""
         return [angle + torque / p['stiffness'], rate]
+
+    def start_spreads(self, p):
+        """Wound up by START_TORQUE more or less, and as much energy in the rotor's motion."""
+        natural = ca.sqrt(p['stiffness'] * p['rotor_inertia'])
+        return [START_TORQUE / p['stiffness'], START_TORQUE / natural]

@@ -5,6 +5,7 @@ import casadi as ca
 from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
+START_BEND = 1 / 3**0.5  # standard deviation of what is evenly spread from -1 to 1
 SLIDING_RATE = 0.01  # rad/s; a joint faster than this at the start is sliding already
 
 
@@ -52,3 +53,7 @@ class PreslidingFriction(Effect):
     def initial_states(self, angle, rate, torque, p):
         """Fully bent where the joint moves, relaxed where it rests."""
         return [ca.tanh(rate / SLIDING_RATE)]
+
+    def start_spreads(self, p):
+        """Bristles lie between -1 and 1, the evener the wider they have been moved."""
+        return [START_BEND]
