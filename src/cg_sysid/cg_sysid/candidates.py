@@ -213,7 +213,8 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
     return Outcome(
-        task, label, model, best, held_score, residuals, best.belief,
+        task, label, model, best, held_score, residuals,
+        best.belief + best.starts + held_score.starts,
         # Small faults cost nothing: every robot has them.
         shared_unknowns(best, task.bounds) + _own_count(best, (*train, *held)), events,
         (tuple(t.name for t in train), tuple(t.name for t in held)),

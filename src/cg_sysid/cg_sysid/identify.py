@@ -146,6 +146,7 @@ class Fit:
         refinement: Integration steps that were taken in place of one.
         converged: False if it stopped at the limit of iterations.
         warnings: What a person should know: bounds, correlations, unidentifiable directions.
+        starts: What the starts of extra states cost as evidence, in the unit of `belief`.
     """
 
     model: Model
@@ -166,6 +167,7 @@ class Fit:
     refinement: float
     converged: bool
     warnings: tuple[str, ...] = ()
+    starts: float = 0.0
 
     @property
     def sigmas(self) -> np.ndarray:
@@ -280,9 +282,10 @@ def fit(
         )  # fmt: skip
         kept_fits.keep(place, end.numbers())
     values = problem.values(end.theta)
-    covariance, information, own_sigmas = uncertainty(
+    covariance, information, sigmas = uncertainty(
         problem, end.theta, end.motions, longest, end.weight
     )
+    unsettled = len(unsettled_states(model))
     values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
     result = Fit(
@@ -293,7 +296,11 @@ def fit(
         information=information,
         motions=tuple(end.motions),
         own=problem.own,
-        own_sigmas=own_sigmas,
+        own_sigmas=tuple(s[unsettled:] for s in sigmas),
+        starts=_demanded(
+            [m[len(t.motion) :][:unsettled] for t, m in zip(trials, end.motions, strict=True)],
+            [s[:unsettled] for s in sigmas],
+        ),
         cost=end.cost,
         mse=end.sse / np.maximum(end.count, 1),
         count=end.count,
@@ -504,6 +511,16 @@ def _unseen(
 def _weight(problem: Problem, point: Point) -> float:
     step = np.median(np.concatenate([np.diff(trial.time) for trial in problem.trials]))
     return float(weight_of(point.sse.sum() / point.count.sum(), step))
+
+
+def _demanded(away: Sequence[np.ndarray], sigmas: Sequence[np.ndarray]) -> float:
+    """Twice the nats that starts of extra states cost, by Laplace's approximation.
+
+    Each was believed to be 0 +- 1: what it is away from that, and how much narrower the data make
+    it. What they do not see costs nothing.
+    """
+    narrower = np.clip(np.concatenate(sigmas), 1e-6, 1.0)
+    return float((np.concatenate(away) ** 2).sum() - 2 * np.log(narrower).sum())
 
 
 def _as_waves_are_written(

@@ -138,7 +138,7 @@ class Jury:
             found = [_evidence(o, independent) for o in outcomes]
         else:
             found = [
-                evidence(f.squares, samples(o), independent, o.unknowns, f.belief)
+                evidence(f.squares, samples(o), independent, o.unknowns, f.belief + f.starts)
                 for f, o in zip(joint, outcomes, strict=True)
             ]
         ranked = [

@@ -14,7 +14,8 @@ def uncertainty(
 
     Returns:
         Covariance of the coordinates (k, k), the share of each that comes from data (k,), and
-        the standard deviations of each trial's own values behind its initial motion.
+        the standard deviations of what each trial has of its own behind its initial motion: how
+        far extra states are from settled, and its own values.
 
     Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
     right for white residuals, and the sandwich of scores summed over blocks longer than their
@@ -23,7 +24,7 @@ def uncertainty(
     point = evaluate(problem, theta, motions, horizon, weight)
     k = len(theta)
     if point is None:
-        return np.zeros((k, k)), np.zeros(k), tuple(np.zeros(len(problem.own)) for _ in motions)
+        return np.zeros((k, k)), np.zeros(k), _unknown(problem)
     excess = max(1.0, point.sse.sum() / point.count.sum())
     rescale = 1 / (excess * weight)
     if not k:
@@ -50,18 +51,24 @@ def _own_sigmas(
     problem: Problem, point: Point, covariance: np.ndarray, rescale: float
 ) -> tuple[np.ndarray, ...]:
     """Standard deviation of each trial's own values, what is shared being uncertain too."""
-    count = len(problem.own)
-    if not count:
-        return tuple(np.zeros(0) for _ in problem.trials)
-    found = [np.zeros(count) for _ in problem.trials]
+    found = list(_unknown(problem))
+    if not any(map(len, found)):
+        return tuple(found)
     shared = np.where(np.isfinite(covariance), covariance, 0.0)
     for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
         moved = solve(own, cross)
         spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
         sigmas = np.sqrt(np.maximum(np.diag(spread), 0.0))
         for i, place in zip(block.trials, block.places, strict=True):
-            found[i] = sigmas[place][-count:]
+            found[i] = sigmas[place][len(problem.trials[i].motion) :]
     return tuple(found)
+
+
+def _unknown(problem: Problem) -> tuple[np.ndarray, ...]:
+    return tuple(
+        np.zeros(len(guess) - len(trial.motion))
+        for guess, trial in zip(problem.guesses, problem.trials, strict=True)
+    )
 
 
 def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

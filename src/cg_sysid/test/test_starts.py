@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.compiled import compile_model
+from cg_dynamics.effects.effect import START_TORQUE
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, own_parameters, try_candidate
-from cg_sysid.identify import fit
+from cg_sysid.candidates import THOROUGH_ITERATIONS, Task, own_parameters, try_candidate
+from cg_sysid.identify import fit, predict, score
 from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.trial import pieces, prepare
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 
@@ -141,6 +144,7 @@ def test_a_curved_valley_is_followed_to_its_end(model_file, start):
     at = {'stiffness': start, 'rotor_inertia': 0.1, 'damping': 0.3}
     found = fit(
         nominal.with_effect('joint_flexibility'), trials, thorough=True,
+        iterations=THOROUGH_ITERATIONS,
         at={f'joint_flexibility.{name}': value for name, value in at.items()},
     )  # fmt: skip
     # Noise alone gives 1, within a percent or two at twelve thousand rows.
@@ -171,3 +175,64 @@ def test_intervals_hold_what_they_promise(model_file):
     # 48 intervals of 95 %: fewer than 41 inside has a chance of 1 %.
     assert len(inside) == 48
     assert sum(inside) >= 41
+
+
+@pytest.mark.parametrize(
+    ('effect', 'values', 'settled'),
+    [
+        # chi2/N of the true numbers, were all started settled: measured 8.7, 505, 545.
+        ('joint_flexibility', {'stiffness': 260.0, 'rotor_inertia': 0.09, 'damping': 0.1}, 4),
+        ('presliding_friction', {'torque': 1.0, 'deflection': 0.05, 'damping': 0.0}, 100),
+        ('actuator_lag', {'time_constant': 0.2}, 100),
+    ],
+)
+def test_pieces_that_begin_in_motion(model_file, effect, values, settled):
+    # The torque is on where pieces begin: rotors swing, bristles are half bent, filters lag.
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect(effect, **values)
+    records = [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
+            [lambda t, f=1.5 + 0.2 * k: 6.0 * math.sin(2 * math.pi * (f + 0.5 * t) * t)],
+            4.0, 0.004, k,
+        )
+        for k in range(2)
+    ]  # fmt: skip
+    trials = [
+        piece
+        for trial in prepare(nominal, records)
+        for _, piece in pieces(nominal.mechanism, trial, 1.0)
+    ]
+    true = score(machine, trials)
+    assert true.normalised_error < 1.1  # noise alone gives 1, within 3 % at 4000 samples
+    errors = []
+    for trial, own in zip(trials, true.motions, strict=True):
+        at_rest = np.concatenate([own[:4], np.zeros(len(own) - 4)])
+        residual = (predict(machine, trial, at_rest) - trial.outputs) / trial.sigma
+        errors.append(np.nanmean(residual**2))
+    assert np.mean(errors) > settled
+    away = nominal.with_effect(effect, **{name: 1.3 * value for name, value in values.items()})
+    found = fit(away, trials)
+    assert found.normalised_error < 1.1
+    for u, value, sigma in zip(found.unknowns, found.values, found.sigmas, strict=True):
+        true_value = machine.values[u.name]
+        # Four standard deviations, and 1 % of what the fit integrates more coarsely.
+        assert abs(value - true_value) < 4 * sigma + 0.01 * abs(true_value), u.name
+    # Starts of each record cost evidence, as any number that data determine.
+    assert found.starts > 0
+
+
+def test_a_spring_starts_wound_up_by_the_torque_that_arrives(model_file):
+    # Behind a lagging drive it is the torque of the motor, settled or not, that winds it up.
+    model = Model.load(model_file).with_effect('actuator_lag', time_constant=0.1)
+    model = model.with_effect('joint_flexibility', stiffness=200.0)
+    compiled = compile_model(model, Setup(springs=SPRINGS))
+    p, motion = parameter_vector(model, Setup(springs=SPRINGS)), [0.1, -0.2, 0.0, 0.0]
+    spread = START_TORQUE
+    for away in (0.0, 0.4):
+        x0 = compiled.initial_state(np.array([*motion, away, 0.0, 0.0]), np.array([6.0]), p)
+        x = dict(zip(compiled.state_names, x0, strict=True))
+        torque = x['actuator_lag.torque']
+        assert torque == pytest.approx(6.0 + away * spread)
+        row = np.array(model.mechanism.joints['hip']) @ np.array(motion[:2])
+        assert x['joint_flexibility.rotor_angle'] - row == pytest.approx(torque / 200.0)
