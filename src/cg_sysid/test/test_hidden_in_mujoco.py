@@ -2,7 +2,7 @@
 
 MuJoCo integrates its own rigid bodies at its own step; only signs and angles have the same
 meaning. The robot has no hip body there (mujoco_robot.two_links). All 31 kinds, a flexible joint
-among them, are in bench/hidden_in_mujoco.py, which counts what these tests assert as exact.
+among them, are in bench/foreign_laws.py; bench/outside.py counts.
 """
 
 import numpy as np
