@@ -106,6 +106,9 @@ def print_gain(console: Console, facts: Facts) -> None:
             plain_unit(gain['unit']), f'{gain["ratio"]:.3g} x' if gain['ratio'] else '',
         )  # fmt: skip
     console.print(table)
+    measured = facts.get('gain_from_measured_start')
+    if measured and measured['helps']:
+        console.print(f'  [bold]also[/] {measured["text"]}', highlight=False)
 
 
 def print_leftover(console: Console, facts: Facts) -> None:

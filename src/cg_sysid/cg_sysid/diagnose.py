@@ -20,6 +20,7 @@ import numpy as np
 
 from cg_dynamics.contact import contact_law
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.advice import Proposal, propose
@@ -48,7 +49,6 @@ from cg_sysid.diagnosis import (
     Candidate,
     Cause,
     Diagnosis,
-    Gain,
     Options,
     Round,
     contains,
@@ -57,6 +57,7 @@ from cg_sysid.diagnosis import (
     per_output,
     summary_of,
 )
+from cg_sysid.gain import Gain
 from cg_sysid.held_foot import held_by_friction
 from cg_sysid.identify import Fit
 from cg_sysid.imperfections import (
@@ -80,6 +81,7 @@ from cg_sysid.jury import (
 from cg_sysid.kept_fits import keeping, kept_in
 from cg_sysid.landing_cause import with_landings
 from cg_sysid.late_samples import late_samples
+from cg_sysid.measured_start import MeasuredStart, judged
 from cg_sysid.parallel import run_all
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.race import RUNGS, Effects, Race
@@ -867,6 +869,13 @@ class _Search:
     def _gains(self, nominal: Outcome, final: Outcome) -> tuple[Gain, ...]:
         return gains_of(self.nominal, self.held, nominal.held, final.held)
 
+    def _from_measured_angles(self, nominal: Outcome, final: Outcome) -> MeasuredStart | None:
+        try:
+            return judged(self.nominal.mechanism, self.held, nominal.held, final.held)
+        except (IdentificationError, DynamicsError, OutOfTime) as error:
+            log.info('from measured angles: %s', error)
+            return None
+
     def _answer(
         self,
         nominal: Outcome,
@@ -885,6 +894,8 @@ class _Search:
             verdict, causes, gains, self._left(final), tuple(strained(nominal)), unmodelled,
             self.options.effects, wandering, share_explained(nominal.held, final.held), late,
         )  # fmt: skip
+        measured_start = self._from_measured_angles(nominal, final) if causes else None
+        doubt = [measured_start.text] if measured_start and not measured_start.helps else []
         return Diagnosis(
             verdict=verdict,
             summary=f'{summary} {unfinished.text}' if unfinished else summary,
@@ -899,12 +910,13 @@ class _Search:
             remaining=self._remaining(final),
             findings=(
                 *self._small_faults(final), *_shapes(final), *_outstanding(final),
-                *(self._own_judges() if causes else ()), *final.train.warnings,
+                *doubt, *(self._own_judges() if causes else ()), *final.train.warnings,
             ),
             unmodelled=unmodelled,
             wandering=wandering,
             late=late,
             unfinished=unfinished,
+            measured_start=measured_start,
         )  # fmt: skip
 
 

@@ -14,8 +14,10 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
+from cg_sysid.gain import Gain
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
+from cg_sysid.measured_start import MeasuredStart
 from cg_sysid.so_far import Unfinished
 from cg_sysid.text import listed, measured, number
 from cg_sysid.trial import Trial
@@ -28,25 +30,6 @@ INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 MOST_TOLD = 3  # events of single records in the summary
 CERTAIN = 30.0  # nats: odds of 1e13 to 1, beyond what a noise floor a little off could feign
 MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Simulation error of one output before and after, on records held out.
-
-    Attributes:
-        channel: Output channel.
-        unit: Its unit.
-        before: RMS error of the nominal model, identified anew, in `unit`.
-        after: RMS error of the extended model.
-        noise: Noise floor of the sensor.
-    """
-
-    channel: str
-    unit: str
-    before: float
-    after: float
-    noise: float
 
 
 @dataclass(frozen=True)
@@ -151,6 +134,9 @@ class Diagnosis:
             one explains most of it.
         late: What errors of timing make of an error that stays unexplained, as a sentence; empty
             where there are none.
+        unfinished: What an early end left undone; None for a whole search.
+        measured_start: The gain where held-out records start at measured angles; None where no
+            cause is named, or their starts carry nowhere.
     """
 
     verdict: str
@@ -170,6 +156,7 @@ class Diagnosis:
     wandering: Wandering | None = None
     late: str = ''
     unfinished: Unfinished | None = None
+    measured_start: MeasuredStart | None = None
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,12 @@ from cg_sysid.diagnosis import (
     Candidate,
     Cause,
     Diagnosis,
-    Gain,
     Round,
     gains_of,
     is_determined,
 )
 from cg_sysid.findings import Finding
+from cg_sysid.gain import Gain
 from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
 from cg_sysid.landing_cause import landing_gains, words
@@ -81,6 +81,7 @@ def diagnosis_facts(
         'gain': {
             g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in diagnosis.gains
         },
+        'gain_from_measured_start': _measured_start(diagnosis),
         'remaining_error': {
             channel: {
                 'chi2_per_sample': chi2,
@@ -118,6 +119,7 @@ def unusable_facts(
         **_head(DIAGNOSIS, 'unusable', reason + _in_spite_of(intake), model),
         'causes': [],
         'gain': {},
+        'gain_from_measured_start': None,
         'remaining_error': {},
         'unmodelled': None,
         'wandering': None,
@@ -238,6 +240,19 @@ def _character(model: Model, channel: str, curves: Sequence[Curve]) -> Facts:
 
 def _rms(mse: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.sqrt((mse * count).sum(axis=0) / np.maximum(count.sum(axis=0), 1))
+
+
+def _measured_start(diagnosis: Diagnosis) -> Facts | None:
+    found = diagnosis.measured_start
+    if found is None:
+        return None
+    return {
+        'helps': found.helps,
+        'text': found.text,
+        'carried_s': dict(found.carried),
+        'whole': found.whole,
+        'gain': {g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in found.gains},
+    }
 
 
 def _gain(before: float, after: float, noise: float, unit: str) -> Facts:

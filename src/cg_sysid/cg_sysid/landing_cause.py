@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis import Cause, Diagnosis, Gain, described
+from cg_sysid.diagnosis import Cause, Diagnosis, described
+from cg_sysid.gain import Gain
 from cg_sysid.landed import Landings
 from cg_sysid.landing_jury import Run, judge_landings
 from cg_sysid.phases import Landing

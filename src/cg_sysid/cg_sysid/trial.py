@@ -7,7 +7,7 @@ can be matched at all, and a first guess of the motion at the first row.
 import functools
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -43,6 +43,7 @@ class Trial:
         setup: The set-up.
         motion: First guess of the free coordinates and rates at the first row, shape (2m,).
         motion_sigma: How far the guess may be off, one standard deviation, shape (2m,).
+        motion_noise: Covariance that the noise of its samples gives the guess, shape (2m, 2m).
     """
 
     name: str
@@ -57,6 +58,7 @@ class Trial:
     motion_sigma: np.ndarray
     since: float = 0.0
     session: float = 0.0
+    motion_noise: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def inputs_for(self, names: Sequence[str]) -> np.ndarray:
         """Inputs in the order that a model wants, shape (n, len(names)).
@@ -154,7 +156,7 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     outputs = np.column_stack(
         [record.outputs.get(channel, np.full(len(time), np.nan)) for channel in body.outputs]
     )
-    motion, motion_sigma = initial_motion(body, record.setup, time, outputs, sigma)
+    motion, noise = measured_motion(body, record.setup, time, outputs, sigma)
     return Trial(
         name=record.name,
         recording=recording_of(record),
@@ -165,8 +167,9 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
         sigma=sigma,
         setup=record.setup,
         motion=motion,
-        motion_sigma=motion_sigma,
+        motion_sigma=_generous(motion, noise),
         since=record.since,
+        motion_noise=noise,
     )
 
 
@@ -184,15 +187,17 @@ def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Tr
         time, outputs = trial.time[a:b] - trial.time[a], trial.outputs[a:b]
         if b - a < 2 or time[-1] < length / 2 or not np.isfinite(outputs).any():
             continue
-        motion, spread = trial.motion, trial.motion_sigma
+        motion, noise = trial.motion, trial.motion_noise
+        spread = trial.motion_sigma
         if a > 0:
             if np.isfinite(outputs[time <= START_WINDOW]).sum(axis=0).max() < 3:
                 continue  # samples are missing there
-            motion, spread = initial_motion(body, trial.setup, time, outputs, trial.sigma)
+            motion, noise = measured_motion(body, trial.setup, time, outputs, trial.sigma)
+            spread = _generous(motion, noise)
         piece = replace(
             trial, name=f'{trial.name}[{a}:{b}]', time=time, inputs=trial.inputs[a:b],
             outputs=outputs, motion=motion, motion_sigma=spread,
-            since=trial.since + float(trial.time[a]),
+            since=trial.since + float(trial.time[a]), motion_noise=noise,
         )  # fmt: skip
         found.append((float(trial.time[a]), piece))
     return found
@@ -214,6 +219,33 @@ def initial_motion(
     body: Mechanism, setup: Setup, time: np.ndarray, outputs: np.ndarray, sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """First guess of free coordinates and rates at the first row, and how far it may be off."""
+    motion, noise = measured_motion(body, setup, time, outputs, sigma)
+    return motion, _generous(motion, noise)
+
+
+def _generous(motion: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    # The window's polynomial is itself an approximation, and the sensors may be late.
+    m = len(motion) // 2
+    late = LATEST * np.concatenate([np.abs(motion[m:]), np.full(m, FASTEST)])
+    least = np.concatenate([np.full(m, 1e-3), np.full(m, 1e-1)])
+    return 10 * np.sqrt(np.diag(noise)) + late + least
+
+
+def measured_motion(
+    body: Mechanism, setup: Setup, time: np.ndarray, outputs: np.ndarray, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Free coordinates and rates at the first row by the first samples, and their noise.
+
+    Args:
+        body: The mechanism.
+        setup: The set-up.
+        time: Stamps in s from the first row, shape (n,).
+        outputs: Measured outputs, shape (n, ny).
+        sigma: Their noise, shape (ny,).
+
+    Returns:
+        Motion, shape (2m,), and the covariance that the noise of the samples gives it.
+    """
     # Value and slope of each channel over a short window, then least squares on (s, ds/dt):
     # the slope of an angle is a rate, so encoders alone give rates too.
     matrix = sensor_matrix(body, setup)
@@ -240,8 +272,5 @@ def initial_motion(
     a, b, w = np.array(rows), np.array(values), np.array(weights)
     motion, *_ = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)
     information = (a * w[:, None]).T @ (a * w[:, None])
-    spread = np.sqrt(np.diag(np.linalg.pinv(information)))
-    # The window's polynomial is itself an approximation, and the sensors may be late: be generous.
-    late = LATEST * np.concatenate([np.abs(motion[m:]), np.full(m, FASTEST)])
-    return motion, 10 * spread + late + np.concatenate([np.full(m, 1e-3), np.full(m, 1e-1)])
+    return motion, np.linalg.pinv(information)
 

@@ -9,7 +9,8 @@ import pytest
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.diagnose import diagnose, verdict_of
-from cg_sysid.diagnosis import Cause, Gain, Options, contains, summary_of
+from cg_sysid.diagnosis import Cause, Options, contains, summary_of
+from cg_sysid.gain import Gain
 from cg_sysid.rehearse import rehearse
 
 

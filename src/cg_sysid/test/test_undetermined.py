@@ -10,7 +10,8 @@ from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.candidates import Task, try_candidate
-from cg_sysid.diagnosis import Cause, Gain, summary_of
+from cg_sysid.diagnosis import Cause, summary_of
+from cg_sysid.gain import Gain
 from cg_sysid.identify import fit
 from cg_sysid.jury import Jury
 from cg_sysid.rehearse import rehearse

@@ -269,8 +269,18 @@ def gain(facts: Facts) -> Markup | None:
                             class_='scale', aria_hidden='true'), tag('div'),
             tag('div', 'error / sensor noise', class_='axis', aria_hidden='true'),
             class_='gain'),
+        _second_judgement(facts),
         class_='card',
     )  # fmt: skip
+
+
+def _second_judgement(facts: Facts) -> Markup | None:
+    """The same where records start at the angles that were measured."""
+    found = facts.get('gain_from_measured_start')
+    if not found:
+        return None
+    text = found['text']
+    return tag('p', f'{text[0].upper()}{text[1:]}.', class_='small')
 
 
 def _key(kind: str, text: str) -> Markup:
