@@ -180,7 +180,9 @@ def records_of(case: Case) -> tuple[Model, list[Record], dict[str, dict[str, flo
     table = yaml.safe_load(hidden_effects_file().read_text(encoding='utf-8'))
     listed = [law for law in case.laws if law in LAWS]
     values = {law: draw_values(table[law.partition('/')[0]], rng) for law in listed}
-    pushed = int(rng.integers(len(PROGRAMME)))
+    # Where the leg that stands is held, a push at the hip does nothing.
+    free = [i for i, name in enumerate(PROGRAMME) if load_experiment(name).setup.springs]
+    pushed = int(rng.choice(free))
     records = []
     for i, experiment in enumerate(PROGRAMME):
         machine = Machine(
