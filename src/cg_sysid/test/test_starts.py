@@ -180,10 +180,11 @@ def test_intervals_hold_what_they_promise(model_file):
 @pytest.mark.parametrize(
     ('effect', 'values', 'settled'),
     [
-        # chi2/N of the true numbers, were all started settled: measured 8.7, 505, 545.
+        # chi2/N of the true numbers, were all started settled: measured 8.7, 505, 545, 16.
         ('joint_flexibility', {'stiffness': 260.0, 'rotor_inertia': 0.09, 'damping': 0.1}, 4),
         ('presliding_friction', {'torque': 1.0, 'deflection': 0.05, 'damping': 0.0}, 100),
         ('actuator_lag', {'time_constant': 0.2}, 100),
+        ('imu_lag', {'time_constant': 0.1}, 4),
     ],
 )
 def test_pieces_that_begin_in_motion(model_file, effect, values, settled):
