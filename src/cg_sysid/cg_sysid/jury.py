@@ -196,7 +196,7 @@ class Jury:
         own = own_parameters(o)
         reasons += at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
-        if left > HALVED or not _known_at_all(o):
+        if at_noise(base) or left > HALVED or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
         reasons += as_sound_robots(o.label, own)
         return Candidate(

@@ -1,0 +1,77 @@
+"""Laws of another shape than the library's: named as the effect that they are a shape of."""
+
+import math
+
+import casadi as ca
+import pytest
+from unlisted import DetentTorque, hide, records
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import TIME
+from cg_dynamics.effects.unmodelled import UNMODELLED
+from cg_dynamics.model import Model
+from cg_sysid.diagnose import diagnose
+from cg_sysid.diagnosis import Options
+
+CYCLES, PHASE = 18.23, 0.82
+
+
+class Triangle(DetentTorque):
+    """Cogging that rises and falls in straight lines."""
+
+    name = 'hidden_triangle'
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return 0.8 * 2 / math.pi * ca.asin(ca.sin(CYCLES * angle + PHASE)), []
+
+
+class TenTightPlaces(DetentTorque):
+    """A bearing with ten tight places in a turn."""
+
+    name = 'hidden_tight_places'
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -0.8 * (1 + ca.cos(10 * angle - 1.7)) / 2 * ca.tanh(rate / 0.01), []
+
+
+class StraightDrift(DetentTorque):
+    """Friction that falls in a straight line, by half over six seconds."""
+
+    name, extra_inputs = 'hidden_straight_drift', (TIME,)
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return -1.4 * (1 - p[TIME] / 12) * ca.tanh(rate / 0.01), []
+
+
+@pytest.fixture(scope='module')
+def nominal(model_file):
+    return Model.load(model_file)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('hidden', 'name', 'listed'),
+    [
+        (Triangle, 'cogging_torque', ('torque_bias',)),
+        (TenTightPlaces, 'position_dependent_friction', ('asymmetric_friction',)),
+        (StraightDrift, 'friction_drift', ('stribeck_friction',)),
+    ],
+)
+def test_a_law_of_another_shape_is_named(nominal, hidden, name, listed):
+    made = records(hide(nominal, hidden))
+    answer = diagnose(nominal, made, Options(effects=(name, *listed), workers=1))
+    assert answer.verdict == 'explained', answer.summary
+    assert answer.causes[0].label == name
+    parameters = answer.causes[0].parameters
+    if hidden is Triangle:
+        # The first wave of a triangle has 8/pi^2 of its height; its third is described.
+        assert parameters['cycles'][0] == pytest.approx(CYCLES, rel=0.01)
+        assert parameters['amplitude'][0] == pytest.approx(0.8 * 8 / math.pi**2, rel=0.05)
+    if hidden is TenTightPlaces:
+        assert parameters['cycles'][0] == pytest.approx(10, rel=0.01)
+        assert answer.extended.held.normalised_error < 1.05
+
+
+def test_families_are_those_of_learned_terms():
+    known = {kind.family for kind in UNMODELLED.values()}
+    assert {kind.family for kind in LIBRARY.values() if kind.family} <= known
