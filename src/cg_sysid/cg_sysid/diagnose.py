@@ -786,7 +786,8 @@ class _Search:
         for name, kind in LIBRARY.items():
             if kind.family != term.effect.family or kind.wave is None:
                 continue
-            if all(p.name != 'cycles' for p in kind.parameters):
+            count = next((p for p in kind.parameters if p.name == 'cycles'), None)
+            if count is None or not count.lower <= cycles <= count.upper:
                 continue
             at = kind(self.nominal.mechanism, term.effect.site).at
             for turn in QUARTERS:
