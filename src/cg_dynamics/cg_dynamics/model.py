@@ -154,8 +154,9 @@ class Model:
                     effect.name,
                     effect.at,
                     {
-                        p.name: self.quantities[f'{effect.label}.{p.name}']
+                        p.name: q
                         for p in effect.parameters
+                        if not _says_nothing(p, q := self.quantities[f'{effect.label}.{p.name}'])
                     },
                 )
                 for effect in self.effects
@@ -275,6 +276,16 @@ def _effect(entry: EffectEntry, body: Mechanism, place: str) -> Effect:
     except ModelError as error:
         hint = '' if entry.name in LIBRARY else meant(entry.name, LIBRARY)
         raise ModelError(f'{place}: {error}{hint}') from None
+
+
+def _says_nothing(declared: Parameter, q: Quantity) -> bool:
+    """Whether a shape is so by default and changes nothing.
+
+    It stays out of files: a law that gets a shape more is still the law by whose hash bags and
+    trees know the model.
+    """
+    usual = Quantity(declared.default, declared.unit, fixed=not declared.free)
+    return bool(declared.leeway) and declared.neutral is not None and q == usual
 
 
 def _entries_read_only(channels):

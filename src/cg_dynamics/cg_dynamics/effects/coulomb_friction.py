@@ -38,7 +38,7 @@ class CoulombFriction(Effect):
         TRANSITION_RATE,
         Parameter(
             'tails', '1', 'share of a law with the slow tails of an arctan', -0.5, 1.0,
-            starts=(0.0,), scale=0.1, free=False, leeway=1.0,
+            neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0,
         ),
     )  # fmt: skip
     largest_step = 0.002
