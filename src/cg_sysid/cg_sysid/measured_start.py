@@ -83,11 +83,7 @@ def judged(
     Raises:
         IdentificationError: if a model cannot be simulated from there.
     """
-    rows = [_carries(before, i, trial) for i, trial in enumerate(trials)]
-    held = [
-        _held(trial, n) for trial, n in zip(trials, rows, strict=True)
-        if n >= SHORTEST * len(trial.time)
-    ]  # fmt: skip
+    held = from_measured_angles(trials, before)
     if not held:
         return None
     scores = [score(fit.model, held, fit.own_by_name(trials)) for fit in (before, after)]
@@ -103,8 +99,25 @@ def judged(
         )
         if n
     )
-    whole = all(n == len(trial.time) for trial, n in zip(trials, rows, strict=True))
+    rows = {trial.name: len(trial.time) for trial in held}
+    whole = all(rows.get(trial.name) == len(trial.time) for trial in trials)
     return MeasuredStart(tuple(gains), {trial.name: trial.duration for trial in held}, whole)
+
+
+def from_measured_angles(trials: Sequence[Trial], before: Fit) -> list[Trial]:
+    """The trials with their angles at the start as measured, as far as these carry them.
+
+    Those that are carried nowhere are left out.
+
+    Args:
+        trials: Records.
+        before: Score on them of the model whose error says how far.
+    """
+    rows = [_carries(before, i, trial) for i, trial in enumerate(trials)]
+    return [
+        _held(trial, n) for trial, n in zip(trials, rows, strict=True)
+        if n >= SHORTEST * len(trial.time)
+    ]  # fmt: skip
 
 
 def _held(trial: Trial, rows: int) -> Trial:
