@@ -1,6 +1,7 @@
 """How far records can be followed, and the windows that follow from it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.bags import write_bag
 from cg_sysid.diagnose import judging_whole
 from cg_sysid.following import (
     FOLLOWED,
@@ -18,6 +20,7 @@ from cg_sysid.following import (
     sensitivities,
     windows_of,
 )
+from cg_sysid.intake import take_in
 from cg_sysid.rehearse import rehearse
 from cg_sysid.trial import prepare
 
@@ -91,6 +94,27 @@ def test_what_stands_upright_is_cut_where_the_error_has_grown_a_hundredfold(pend
     assert len(parts) == len(found.cuts) + 1
     assert sum(len(part) for part in parts) == len(stands)  # nothing is left out
     assert all(part.duration > 0.9 * SHORTEST_WINDOW for part in parts)
+
+
+def test_bags_are_cut_where_they_cannot_be_followed(pendulum, tmp_path):
+    made = {
+        'swings': record(pendulum, Setup(), [0.5, 0.0], duration=3.0),
+        'stands': record(pendulum, Setup(), [math.pi, 0.0], duration=3.0),
+    }
+    bags = [write_bag(tmp_path / name, replace(r, name=name)) for name, r in made.items()]
+    model_file = tmp_path / 'pendulum.yaml'
+    pendulum.save(model_file)
+    intake = take_in(bags, model_file)
+    whole, lost = intake.windows.records
+    assert (whole.name, whole.whole, lost.whole) == ('swings', True, False)
+    assert intake.wholes == ()
+    assert intake.records[0].name == 'swings'
+    parts = [r for r in intake.records if intake.origin[r.name] == 'stands']
+    assert len(parts) == len(lost.cuts) + 1 > 2
+    chosen = take_in(bags, model_file, window=1.0)
+    assert chosen.windows.chosen == 1.0
+    # Of what cannot be followed no whole can judge, whoever chose the windows.
+    assert [r.name for r in chosen.wholes] == ['swings']
 
 
 def test_what_is_told():
