@@ -112,7 +112,7 @@ def windows_of(record: Record, found: Followed) -> list[Record]:
     """The record, or the windows between its cuts."""
     if found.whole:
         return [record]
-    edges = (0.0, *found.cuts, math.inf)
+    edges = (0.0, *found.cuts, math.nextafter(record.duration, math.inf))
     return [record.slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
