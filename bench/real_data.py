@@ -34,7 +34,7 @@ from cg_sysid.diagnosis import Options
 from cg_sysid.following import Windows, followed, windows_of
 from cg_sysid.identify import fit, predict, score
 from cg_sysid.importing import import_to_bags
-from cg_sysid.measured_start import from_measured_angles
+from cg_sysid.measured_start import carried, from_measured_angles
 from cg_sysid.text import measured
 from cg_sysid.trial import prepare
 
@@ -99,19 +99,23 @@ def as_followed(model, records):
     return parts, Windows(found).text
 
 
-def errors(study, model, judges):
+def errors(study, model, judges, rows):
     """Summary over records of the error of each channel, for each way to judge."""
-    rows = []
-    for trials in judges:
-        found = score(model, trials)
+    fitted = score(model, judges)
+    ways = [(judges, fitted)]
+    if rows:
+        held = from_measured_angles(model.mechanism, judges, fitted, rows)
+        ways.append((held, score(model, held, fitted.own_by_name(judges))))
+    summaries = []
+    for trials, found in ways:
         table = []
         for trial, motion in zip(trials, found.motions, strict=True):
             difference = predict(model, trial, motion) - trial.outputs
             table.append([
                 study.measure(c) if np.isfinite(c).any() else np.nan for c in difference.T
             ])
-        rows.append(study.summary(np.array(table), axis=0))
-    return np.array(rows)
+        summaries.append(study.summary(np.array(table), axis=0))
+    return np.array(summaries)
 
 
 def cpu_seconds():
@@ -134,7 +138,7 @@ def run(study, data, bags, workers, budget):
     parts, judged_as = as_followed(nominal, judging)
     used, used_as = as_followed(nominal, usable)
     judges = prepare(nominal, parts)
-    carried = from_measured_angles(judges, score(nominal, judges))
+    carry = carried(judges, score(nominal, judges))
     refitted = fit(nominal, prepare(nominal, used)).model
     before = cpu_seconds()
     found = diagnose(nominal, used, Options(workers=workers), deadline=Deadline(budget))
@@ -142,24 +146,23 @@ def run(study, data, bags, workers, budget):
     # The file's beliefs, and the effects found with their values as a start.
     structure = believing(found.extended.model, nominal, '')
     extended = fit(structure, prepare(nominal, used)).model
-    ways = [judges, carried] if carried else [judges]
-    rows = {'published': errors(study, nominal, ways)}
+    rows = {'published': errors(study, nominal, judges, carry)}
     if study.zeroed:
         published = nominal
         for sensor in study.zeroed:
             published = published.with_effect('encoder_zero', sensor)
-        rows['published, with a zero for each recording'] = errors(study, published, ways)
+        rows['published, with a zero for each recording'] = errors(study, published, judges, carry)
     rows |= {
-        'published model, identified anew': errors(study, refitted, ways),
-        'with the causes named': errors(study, extended, ways),
+        'published model, identified anew': errors(study, refitted, judges, carry),
+        'with the causes named': errors(study, extended, judges, carry),
     }
     channels = nominal.mechanism.outputs
     present = [j for j in range(len(channels)) if np.isfinite(rows['published'][0, j])]
     heads = [
         f'{channels[j]}, {nominal.mechanism.output_units[j]}, start {way}'
-        for way in ('fitted', 'measured')[: len(ways)] for j in present
+        for way in ('fitted', 'measured')[: 1 + bool(carry)] for j in present
     ]  # fmt: skip
-    lasts = [trial.duration for trial in carried]
+    lasts = [float(t.time[carry[t.name] - 1]) for t in judges if t.name in carry]
     lines = [
         f'### {study.mapping}',
         '',
@@ -167,8 +170,8 @@ def run(study, data, bags, workers, budget):
         + ', '.join(f'{verdicts.count(v)} {v}' for v in sorted(set(verdicts))) + '. '
         f'{len(used)} records used by the diagnosis ({used_as}), {len(judges)} judge '
         f'({judged_as}): {study.how}. '
-        + (f'Measured angles carry {len(carried)} of them, for {min(lasts):.2g} to '
-           f'{max(lasts):.2g} s.' if carried else 'Measured angles carry none of them.'),
+        + (f'Measured angles carry {len(carry)} of them, for {min(lasts):.2g} to '
+           f'{max(lasts):.2g} s.' if carry else 'Measured angles carry none of them.'),
         '',
         f'Verdict **{found.verdict}**. {found.summary}',
         *(f'Note: {finding}.' for finding in found.findings),
@@ -180,7 +183,7 @@ def run(study, data, bags, workers, budget):
         lines.append(
             f'| {name} | ' + ' | '.join(f'{v:.5f}' for v in row[:, present].ravel()) + ' |'
         )
-    floor = [f'{judges[0].sigma[j]:.5f}' for _ in ways for j in present]
+    floor = [f'{judges[0].sigma[j]:.5f}' for _ in rows['published'] for j in present]
     lines.append('| noise floor | ' + ' | '.join(floor) + ' |')
     lines += ['', '| cause | parameters | evidence, nats | could also be |', '|---|---|---|---|']
     for cause in found.causes:
