@@ -1,16 +1,22 @@
 """Real machines: import, check, identify, diagnose, and judge on records no choice has seen.
 
-    ./cg exec python bench/real_data.py DATA_DIR [--only NAME] [--out FILE]
+    ./cg exec python bench/real_data.py DATA_DIR [--only NAME] [--budget SECONDS] [--write FILE]
 
 DATA_DIR holds the folders of docs/data.md. Each set is cut into records that the diagnosis may
 use (it splits them into training and held-out by itself, to choose among effects) and records on
-which nothing is chosen or fitted but each record's initial motion: those judge.
+which nothing is chosen or fitted but each record's start: those judge. Records are whole wherever
+the whole can be followed (cg_sysid/following.py).
+
+They judge twice. *Start fitted*: initial angles and rates of each record are fitted. *Start
+measured*: the angles are those measured, by a curve through the first samples, and the rates are
+fitted, over as much of each record as measured angles carry (cg_sysid/measured_start.py), the same
+stretch for every model.
 """
 
 import argparse
 import fnmatch
+import resource
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +28,17 @@ from cg_dynamics.model import Model
 from cg_sysid.bags import read_bag
 from cg_sysid.candidates import believing
 from cg_sysid.check import check_recording
+from cg_sysid.deadline import Deadline
 from cg_sysid.diagnose import diagnose
 from cg_sysid.diagnosis import Options
+from cg_sysid.following import Windows, followed, windows_of
 from cg_sysid.identify import fit, predict, score
 from cg_sysid.importing import import_to_bags
+from cg_sysid.measured_start import carried, from_measured_angles
 from cg_sysid.text import measured
 from cg_sysid.trial import prepare
+
+BUDGET = 600.0  # s
 
 
 def rms(error):
@@ -47,57 +58,74 @@ class Study:
         folder: Folder of the data.
         model: Published model, the nominal one.
         judge: Name patterns of the records that judge.
-        share: What of these the diagnosis may use, from their start; the rest judges.
-        window: Length in s into which records are cut for the diagnosis; 0 for whole records.
-        judge_window: The same for judging.
         measure: Error of one record and channel.
         summary: Over records.
+        how: What that is, in words.
+        zeroed: Encoders that were zeroed anew for each recording; the published model is judged
+            with a zero of each judging record's own as well, fitted like its start.
+        share: What of the judging records the diagnosis may use, from their start.
     """
 
     mapping: str
     folder: str
     model: str
     judge: tuple[str, ...]
-    window: float
-    judge_window: float
     measure: Callable
     summary: Callable
     how: str
+    zeroed: tuple[str, ...] = ()
     share: float = 0.0
 
 
 STUDIES = (
-    Study('sydney_pendulum', 'sydney_compass_gait', 'sydney_pendulum', ('*pendulum_2*',), 6.0, 0.0,
-          rms, np.mean, 'RMSE over the second half of the chirp, 20 s open loop', 0.5),
-    Study('sydney_walking', 'sydney_compass_gait', 'sydney_compass_gait',
-          ('*_e07_*', '*_e08_*', '*_e09_*'), 0.0, 0.0, rms, np.mean,
-          'mean RMSE over the steps of experiments 7 to 9'),
-    Study('dfki_double_pendulum', 'dfki_double_pendulum', 'dfki_double_pendulum',
-          ('*-143601*', '*-144115*', '*-1545*'), 1.0, 1.0, rms, np.median,
-          'median RMSE over windows of 1 s of two sine files and one swing-up'),
-    Study('bam_servo_pendulum', 'bam_servo_pendulum', 'xl330_pendulum', ('*kp0200*',), 1.5, 0.0,
+    Study('sydney_pendulum', 'sydney_compass_gait', 'sydney_pendulum', ('*pendulum_2*',),
+          rms, np.mean, 'RMSE over the second half of the chirp, 20 s open loop', ('angle',), 0.5),
+    Study('bam_servo_pendulum', 'bam_servo_pendulum', 'xl330_pendulum', ('*kp0200*',),
           mean_absolute, np.mean, 'mean MAE over the files of gain 200, replayed by duty'),
+    Study('dfki_double_pendulum', 'dfki_double_pendulum', 'dfki_double_pendulum',
+          ('*-143601*', '*-144115*', '*-1545*'), rms, np.median,
+          'median RMSE over two sine files of 10 s and the windows of one swing-up',
+          ('shoulder_angle', 'elbow_angle')),
+    Study('sydney_walking', 'sydney_compass_gait', 'sydney_compass_gait',
+          ('*_e07_*', '*_e08_*', '*_e09_*'), rms, np.mean,
+          'mean RMSE over the steps of experiments 7 to 9'),
 )  # fmt: skip
 
 
-def windows(records, length):
-    return [part for record in records for part in record.segments(length)] if length else records
+def as_followed(model, records):
+    """Records, whole or cut where they cannot be followed, and what is told about it."""
+    found = followed(model, records)
+    parts = [p for r, f in zip(records, found, strict=True) for p in windows_of(r, f)]
+    return parts, Windows(found).text
 
 
-def errors(study, model, trials):
-    """Summary over records of the error of each channel, and chi2/N."""
-    found = score(model, trials)
-    table = []
-    for trial, motion in zip(trials, found.motions, strict=True):
-        difference = predict(model, trial, motion) - trial.outputs
-        table.append([
-            study.measure(c) if np.isfinite(c).any() else np.nan for c in difference.T
-        ])
-    return study.summary(np.array(table), axis=0)
+def errors(study, model, judges, rows):
+    """Summary over records of the error of each channel, for each way to judge."""
+    fitted = score(model, judges)
+    ways = [(judges, fitted)]
+    if rows:
+        held = from_measured_angles(model.mechanism, judges, fitted, rows)
+        ways.append((held, score(model, held, fitted.own_by_name(judges))))
+    summaries = []
+    for trials, found in ways:
+        table = []
+        for trial, motion in zip(trials, found.motions, strict=True):
+            difference = predict(model, trial, motion) - trial.outputs
+            table.append([
+                study.measure(c) if np.isfinite(c).any() else np.nan for c in difference.T
+            ])
+        summaries.append(study.summary(np.array(table), axis=0))
+    return np.array(summaries)
 
 
-def run(study, data, bags, workers):
-    began = time.monotonic()
+def cpu_seconds():
+    """Of this process and of those that it has waited for."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+def run(study, data, bags, workers, budget):
+    began = cpu_seconds()
     nominal = Model.load(model_path(study.model))
     paths = import_to_bags(study.mapping, data / study.folder, bags / study.mapping)
     verdicts = [check_recording(path).verdict for path in paths]
@@ -107,45 +135,56 @@ def run(study, data, bags, workers):
     if study.share:
         usable += [r.slice(0.0, study.share * r.duration) for r in judging]
         judging = [r.slice(study.share * r.duration, np.inf) for r in judging]
-    judges = prepare(nominal, windows(judging, study.judge_window))
-    used = windows(usable, study.window)
+    parts, judged_as = as_followed(nominal, judging)
+    used, used_as = as_followed(nominal, usable)
+    judges = prepare(nominal, parts)
+    carry = carried(judges, score(nominal, judges))
     refitted = fit(nominal, prepare(nominal, used)).model
-    found = diagnose(nominal, used, Options(workers=workers))
+    before = cpu_seconds()
+    found = diagnose(nominal, used, Options(workers=workers), deadline=Deadline(budget))
+    searched = cpu_seconds() - before
     # The file's beliefs, and the effects found with their values as a start.
     structure = believing(found.extended.model, nominal, '')
     extended = fit(structure, prepare(nominal, used)).model
-    rows = {'published': errors(study, nominal, judges)}
-    zeroed = [e for e in extended.effects if any(p.each == 'recording' for p in e.parameters)]
-    if zeroed:
+    rows = {'published': errors(study, nominal, judges, carry)}
+    if study.zeroed:
         published = nominal
-        for effect in zeroed:
-            published = published.with_effect(
-                effect.name, effect.at, **{p.name: p.neutral for p in effect.parameters}
-            )
-        rows['published, with a zero for each recording'] = errors(study, published, judges)
+        for sensor in study.zeroed:
+            published = published.with_effect('encoder_zero', sensor)
+        rows['published, with a zero for each recording'] = errors(study, published, judges, carry)
     rows |= {
-        'published model, identified anew': errors(study, refitted, judges),
-        'with the causes named': errors(study, extended, judges),
+        'published model, identified anew': errors(study, refitted, judges, carry),
+        'with the causes named': errors(study, extended, judges, carry),
     }
     channels = nominal.mechanism.outputs
-    present = [j for j in range(len(channels)) if np.isfinite(rows['published'][j])]
+    present = [j for j in range(len(channels)) if np.isfinite(rows['published'][0, j])]
+    heads = [
+        f'{channels[j]}, {nominal.mechanism.output_units[j]}, start {way}'
+        for way in ('fitted', 'measured')[: 1 + bool(carry)] for j in present
+    ]  # fmt: skip
+    lasts = [float(t.time[carry[t.name] - 1]) for t in judges if t.name in carry]
     lines = [
         f'### {study.mapping}',
         '',
         f'{len(paths)} recordings imported; check: '
         + ', '.join(f'{verdicts.count(v)} {v}' for v in sorted(set(verdicts))) + '. '
-        f'{len(used)} records used by the diagnosis, {len(judges)} judge: {study.how}.',
+        f'{len(used)} records used by the diagnosis ({used_as}), {len(judges)} judge '
+        f'({judged_as}): {study.how}. '
+        + (f'Measured angles carry {len(carry)} of them, for {min(lasts):.2g} to '
+           f'{max(lasts):.2g} s.' if carry else 'Measured angles carry none of them.'),
         '',
         f'Verdict **{found.verdict}**. {found.summary}',
+        *(f'Note: {finding}.' for finding in found.findings),
         '',
-        '| model | ' + ' | '.join(f'{channels[j]}, {nominal.mechanism.output_units[j]}'
-                                   for j in present) + ' |',
-        '|---|' + '---|' * len(present),
-    ]
+        '| model | ' + ' | '.join(heads) + ' |',
+        '|---|' + '---|' * len(heads),
+    ]  # fmt: skip
     for name, row in rows.items():
-        lines.append(f'| {name} | ' + ' | '.join(f'{row[j]:.5f}' for j in present) + ' |')
-    floor = judges[0].sigma
-    lines.append('| noise floor | ' + ' | '.join(f'{floor[j]:.5f}' for j in present) + ' |')
+        lines.append(
+            f'| {name} | ' + ' | '.join(f'{v:.5f}' for v in row[:, present].ravel()) + ' |'
+        )
+    floor = [f'{judges[0].sigma[j]:.5f}' for _ in rows['published'] for j in present]
+    lines.append('| noise floor | ' + ' | '.join(floor) + ' |')
     lines += ['', '| cause | parameters | evidence, nats | could also be |', '|---|---|---|---|']
     for cause in found.causes:
         numbers = ', '.join(
@@ -156,7 +195,7 @@ def run(study, data, bags, workers):
             f'| {cause.label} | {numbers} | {cause.evidence:.0f} '
             f'| {", ".join(cause.rivals) or "-"} |'
         )
-    lines += ['', f'{time.monotonic() - began:.0f} s.', '']
+    lines += ['', f'{cpu_seconds() - began:.0f} CPU s, of which the diagnosis {searched:.0f}.', '']
     return '\n'.join(lines)
 
 
@@ -165,17 +204,18 @@ def main():
     parser.add_argument('data', type=Path)
     parser.add_argument('--only')
     parser.add_argument('--workers', type=int)
-    parser.add_argument('--out', type=Path)
+    parser.add_argument('--budget', type=float, default=BUDGET, help='of each diagnosis, in s')
+    parser.add_argument('--write', type=Path)
     options = parser.parse_args()
     parts = []
     for study in STUDIES:
         if options.only and study.mapping != options.only:
             continue
         with tempfile.TemporaryDirectory() as bags:
-            parts.append(run(study, options.data, Path(bags), options.workers))
+            parts.append(run(study, options.data, Path(bags), options.workers, options.budget))
         print(parts[-1], flush=True)
-    if options.out:
-        options.out.write_text('\n'.join(parts))
+        if options.write:
+            options.write.write_text('\n'.join(parts), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -283,7 +283,7 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
 
 def _vectorised(e: Equations, name: str, prepare: str, *results: ca.SX) -> tuple[str, int]:
     """C of what is not zero of some results, one after the other; and the size of `prepare`'s."""
-    stacked = ca.vertcat(*(r.nz[:] for r in results if r.nnz()))
+    stacked = ca.vertcat(*(ca.vec(r.nz[:]) for r in results if r.nnz()))
     return vector_code(
         ca.Function(name, [e.x, e.u, e.p], [ca.densify(ca.cse(stacked))]), name, prepare
     )

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from cg_description.paths import model_path
 from cg_dynamics import c_compiler
 from cg_dynamics import compiled as module
 from cg_dynamics.assemble import parameter_vector
@@ -13,6 +14,7 @@ from cg_dynamics.compiled import CompiledModel, compile_model, simulate
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.mechanisms import MECHANISMS
+from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
 TIME = np.arange(0, 0.4, 0.002)
@@ -79,6 +81,15 @@ def assert_close(J, differences):
 def test_sensitivities_under_every_effect(bare, springs, name, site):
     model = bare.with_effect(name, at=site, **VALUES.get(name, {}))
     _, _, _, J, differences = jacobian_and_differences(model, Setup(springs=springs))
+    assert_close(J, differences)
+
+
+@pytest.mark.parametrize('name', ['encoder_offset', 'encoder_eccentricity'])
+def test_sensitivities_of_a_machine_with_one_output(name):
+    """Its outputs by several parameters of a sensor are a single row."""
+    model = Model.load(model_path('sydney_pendulum')).with_effect(name)
+    model = model.with_values({'coulomb_friction.transition_rate': 0.1})
+    _, _, _, J, differences = jacobian_and_differences(model, Setup())
     assert_close(J, differences)
 
 

@@ -63,7 +63,7 @@ def to_record(
         mechanism=raw.mechanism,
         setup=setup,
         note=raw.note,
-        source=raw.path,
+        source=raw.note.get('recording') or raw.path,
     )
 
 

@@ -71,8 +71,9 @@ def common_options(parser: argparse.ArgumentParser) -> None:
         help='directory for the results; files of an earlier run in it are replaced',
     )  # fmt: skip
     parser.add_argument(
-        '--window', type=float, metavar='SECONDS', help='cut every record into windows'
-    )
+        '--window', type=float, metavar='SECONDS',
+        help='cut every record into windows [only where the whole cannot be followed]',
+    )  # fmt: skip
     parser.add_argument(
         '--note', metavar='FILE', help='recording note (YAML) for bags that carry none'
     )
@@ -147,6 +148,12 @@ def print_left_out(facts: Facts) -> None:
     for entry in facts['unusable']:
         print(f'left out {entry["source"]}: {one_line(ValueError(entry["reason"]))}',
               file=sys.stderr)  # fmt: skip
+
+
+def print_windows(console: Console, facts: Facts) -> None:
+    """One line where records are not integrated whole."""
+    if facts['windows']['how'] != 'whole':
+        console.print(facts['windows']['text'], highlight=False, markup=False)
 
 
 def print_steps(console: Console, steps: Mapping[str, int], phases: int) -> None:

@@ -195,8 +195,10 @@ def diagnose(
     if landings is None:
         cut = cut_steps(records, model)
         records, landings = cut.records, cut.landings
-    trials = [led_in(trial) for trial in prepare(model, records)]
+    prepared = [led_in(trial) for trial in prepare(model, [*records, *options.wholes])]
+    trials = prepared[: len(records)]
     train, held = split(trials, options.held)
+    held = judging_whole(held, train, prepared[len(records) :])
 
     def answer(train: Sequence[Trial], held: Sequence[Trial]) -> Diagnosis:
         search = _Search(model, train, held, options, progress, executor, deadline)
@@ -238,6 +240,20 @@ def broken_off(found: Diagnosis, deadline: Deadline, step: str) -> Diagnosis:
     marked = replace(before, steps=(*before.steps, step))
     summary = found.summary.removesuffix(f' {before.text}')
     return replace(found, unfinished=marked, summary=f'{summary} {marked.text}')
+
+
+def judging_whole(
+    held: Sequence[Trial], train: Sequence[Trial], wholes: Sequence[Trial]
+) -> list[Trial]:
+    """Held-out trials, whole recordings in place of their windows.
+
+    Windows forgive a model that goes astray slowly: each begins anew. So a recording that can be
+    followed whole judges whole, unless some of its windows are fitted.
+    """
+    fitted = {trial.recording for trial in train}
+    judging = {w.recording: w for w in wholes if w.recording not in fitted}
+    replaced = [judging.get(trial.recording, trial) for trial in held]
+    return list({trial.name: trial for trial in replaced}.values())
 
 
 def led_in(trial: Trial) -> Trial:

@@ -159,6 +159,7 @@ def work(options: argparse.Namespace) -> int:
         shutil.rmtree(options.out / FITS, ignore_errors=True)
     cli.print_left_out(facts)
     cli.print_steps(Console(), intake.steps, intake.phases)
+    cli.print_windows(Console(), facts)
     show(Console(), facts, options.out, options.quiet)
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
 
@@ -238,6 +239,7 @@ def _options(
     return Options(
         effects=effects, rounds=options.rounds, workers=options.workers, held=held,
         experiments=tuple(experiments_for(model)), kept=options.out / FITS,
+        wholes=intake.wholes,
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from cg_sysid.gain import Gain
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
 from cg_sysid.measured_start import MeasuredStart
+from cg_sysid.record import Record
 from cg_sysid.so_far import Unfinished
 from cg_sysid.text import listed, measured, number
 from cg_sysid.trial import Trial
@@ -169,6 +170,8 @@ class Options:
         workers: Local processes.
         held: Names of the records to hold out; by default every second one of each set-up.
         experiments: What can be launched next, where these records do not decide.
+        wholes: Recordings that were cut into windows and can be followed whole: where all their
+            windows are held out, they judge whole.
         kept: Folder where fits of local processes are kept, so that a search that was broken off
             goes on from them; None keeps none.
     """
@@ -179,6 +182,7 @@ class Options:
     held: tuple[str, ...] | None = None
     experiments: tuple[Experiment, ...] = ()
     kept: Path | None = None
+    wholes: tuple[Record, ...] = ()
 
 
 def effect_name(label: str) -> str:

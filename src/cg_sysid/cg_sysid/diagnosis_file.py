@@ -30,6 +30,7 @@ from cg_sysid.diagnosis import (
     is_determined,
 )
 from cg_sysid.findings import Finding
+from cg_sysid.following import Windows
 from cg_sysid.gain import Gain
 from cg_sysid.identify import Fit
 from cg_sysid.intake import Intake
@@ -567,6 +568,23 @@ def _parameter(
     }
 
 
+def _windows(windows: Windows) -> Facts:
+    how = 'whole' if all(f.whole for f in windows.records) else 'cut'
+    return {
+        'how': how if windows.chosen is None else 'chosen by you',
+        'length_s': windows.chosen,
+        'text': windows.text,
+        'followed': {
+            f.name: {
+                'growth': f.growth if math.isfinite(f.growth) else None,
+                'whole': f.whole,
+                'cuts_s': list(f.cuts),
+            }
+            for f in windows.records
+        },
+    }
+
+
 def _data(
     model: Model,
     trials: Sequence[Trial],
@@ -576,7 +594,7 @@ def _data(
     intake: Intake,
 ) -> Facts:
     records = []
-    by_name = {record.name: record for record in intake.records}
+    by_name = {record.name: record for record in (*intake.records, *intake.wholes)}
     for k, (trial, role) in enumerate(zip(trials, roles, strict=True)):
         record = by_name.get(trial.name)
         records.append(
@@ -607,6 +625,7 @@ def _data(
             for channel, s in zip(model.mechanism.outputs, sigma, strict=False)
         },
         'records': records,
+        'windows': _windows(intake.windows),
         'sources': [
             {
                 'name': source.name,

@@ -100,6 +100,7 @@ def work(options: argparse.Namespace) -> int:
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
     cli.print_steps(Console(), intake.steps, intake.phases)
+    cli.print_windows(Console(), facts)
     show(Console(), facts, options.out, options.quiet)
     return 0
 

@@ -137,6 +137,7 @@ SCHEMA = Mapping({
         'by': Key(ListOf(Text()), default=()),
         'at': Key(ListOf(Mapping({'column': Key(Text()), 'value': Key(Number())})), default=()),
         'name': Key(Text(longest=200), default='{name}_{stem}'),
+        'recording': Key(Text(longest=200), default=''),
         'drop_first': Key(Whole(0), default=0),
         'drop_last': Key(Whole(0), default=0),
         'min_rows': Key(Whole(2), default=2),
@@ -304,16 +305,20 @@ def _record_of(
     rate = entries['nominal_rate_hz'] or entries['time'].get('rate_hz')
     if rate:
         note['nominal_rate_hz'] = rate
+    split = mapping.get('split') or {}
+    template = split.get('name', '{name}_{stem}')
+    if split.get('recording'):
+        note['recording'] = _part_name(mapping, path, part, number, split['recording'])
     is_input = {*mechanism.input_names, *mechanism.extra_input_names}
     record = Record(
-        name=_part_name(mapping, path, part, number),
+        name=_part_name(mapping, path, part, number, template),
         stamp_ns=stamps,
         inputs={c: v for c, v in signals.items() if c in is_input},
         outputs={c: v for c, v in signals.items() if c not in is_input},
         mechanism=mechanism.name,
         setup=setup,
         note={**note, 'mechanism': mechanism.name, 'setup': setup.to_dict()},
-        source=str(path),
+        source=note.get('recording') or str(path),
     )
     return Imported(record, commands)
 
@@ -373,9 +378,10 @@ def _start_ns(start: str | dict[str, str], path: Path) -> int:
     return since // timedelta(microseconds=1) * 1000
 
 
-def _part_name(mapping: dict, path: Path, part: Table, number: int) -> str:
+def _part_name(
+    mapping: dict, path: Path, part: Table, number: int, template: str
+) -> str:
     """Name of a part: the mapping's, the file's, its number, values that it was split by."""
-    template = (mapping.get('split') or {'name': '{name}_{stem}'})['name']
     known = {name: _plain(values[0]) for name, values in part.items()}
     known |= {'name': mapping['name'], 'stem': path.stem, 'part': number}
     where = f'{path}: split.name {shown(template)}'

@@ -13,11 +13,18 @@ from cg_sysid.check import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.faults import FaultSignal, fault_signals
 from cg_sysid.findings import CheckReport, Finding, make_report, overrulable
+from cg_sysid.following import (
+    NOT_CUT,
+    SHORTEST_WINDOW,
+    Followed,
+    Windows,
+    followed,
+    windows_of,
+)
 from cg_sysid.phases import Landing, cut_steps
 from cg_sysid.record import Record
 
 TORQUE_TOPICS = {'applied': '/applied_torque', 'command': '/torque_command'}
-SHORTEST_WINDOW = 0.5  # s; less holds no motion to compare
 
 Progress = Callable[[str, int, int], None]
 
@@ -57,12 +64,16 @@ class Intake:
         sources: Every bag, used or not.
         origin: Name of a record -> name of the bag that it is from.
         landings: What lies between the phases of walking records (phases.py).
+        windows: How far each record is followed, and whether a person chose the windows.
+        wholes: Records that a person had cut though they can be followed whole.
     """
 
     records: tuple[Record, ...]
     sources: tuple[Source, ...]
     origin: Mapping[str, str]
     landings: tuple[Landing, ...] = ()
+    windows: Windows = NOT_CUT
+    wholes: tuple[Record, ...] = ()
 
     @property
     def left_out(self) -> tuple[Source, ...]:
@@ -101,10 +112,11 @@ def take_in(
 
     Args:
         bags: Paths of bags.
-        model_file: Model file that they will be used with; with it, walking records are cut.
+        model_file: Model file that they will be used with; with it walking records are cut at
+            their touchdowns, and others where they cannot be followed whole (following.py).
         note: Recording note for bags that carry none.
         torque: `applied` or `command`; by default the applied torque where there is one.
-        window: Cut records into windows of this length in s.
+        window: Cut records into windows of this length in s instead.
         progress: Called with (what, done, total).
         use_anyway: Names of findings by which no bag is left out, as in `check_recording`.
 
@@ -128,14 +140,29 @@ def take_in(
         records.append(record)
         origin[record.name] = name
     progress('reading and checking bags', len(paths), len(paths))
-    cut = cut_steps(records, Model.load(model_file) if model_file else None)
+    model = Model.load(model_file) if model_file else None
+    cut = cut_steps(records, model)
+    windows = _followed(model, cut.records, window)
     pieces: list[Record] = []
-    for record in cut.records:
-        long = window is not None and record.duration > window
-        windows = record.segments(window) if window is not None and long else [record]
-        pieces += windows
-        origin |= {piece.name: origin[cut.origin[record.name]] for piece in windows}
-    return Intake(tuple(pieces), tuple(sources), origin, cut.landings)
+    wholes: list[Record] = []
+    for record, found in zip(cut.records, windows.records, strict=True):
+        parts = [record]
+        if window is not None and record.duration > window:
+            parts = record.segments(window)
+            wholes += [record] if found.whole else []
+        elif window is None:
+            parts = windows_of(record, found)
+        pieces += parts
+        origin |= {p.name: origin[cut.origin[record.name]] for p in (record, *parts)}
+    return Intake(tuple(pieces), tuple(sources), origin, cut.landings, windows, tuple(wholes))
+
+
+def _followed(
+    model: Model | None, records: Sequence[Record], window: float | None
+) -> Windows:
+    if model is None or any(r.mechanism != model.mechanism.name for r in records):
+        return Windows(tuple(Followed(r.name, 1.0) for r in records), window)
+    return Windows(followed(model, records), window)
 
 
 def _distinct(bags: Sequence[str | Path]) -> dict[str, Path]:

@@ -3,14 +3,14 @@
 A diagnosis fits the initial motion of held-out records, as no recording states it exactly. Others
 (the walking compass gait of Sydney, docs/data.md) start from the measured angles and fit the rates
 alone. A cause worth its name gains under both. Measured is what a curve through the first samples
-of each channel says (trial.measured_motion).
+of each channel says (trial.measured_motion), and each model starts where its sensors read that.
 
 Measured angles are uncertain, and on a robot that falls that alone becomes an error of any size.
 So a record is judged for as long as the noise of its start makes less than half of the error of
 the nominal model: this is the whole record where the motion is stable.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from cg_dynamics.mechanisms.mechanism import Mechanism
 from cg_sysid.gain import Gain
 from cg_sysid.identify import Fit, predict, score
 from cg_sysid.text import listed
-from cg_sysid.trial import Trial
+from cg_sysid.trial import Trial, sensor_matrix
 
 OWN_PART = 0.5  # of the nominal model's error, that the noise of the start may make
 SHORTEST = 0.05  # of a record; if the start carries no further, it judges nothing
@@ -83,14 +83,13 @@ def judged(
     Raises:
         IdentificationError: if a model cannot be simulated from there.
     """
-    rows = [_carries(before, i, trial) for i, trial in enumerate(trials)]
-    held = [
-        _held(trial, n) for trial, n in zip(trials, rows, strict=True)
-        if n >= SHORTEST * len(trial.time)
-    ]  # fmt: skip
-    if not held:
+    rows = carried(trials, before)
+    if not rows:
         return None
-    scores = [score(fit.model, held, fit.own_by_name(trials)) for fit in (before, after)]
+    scores = [
+        score(fit.model, from_measured_angles(body, trials, fit, rows), fit.own_by_name(trials))
+        for fit in (before, after)
+    ]
     count = scores[0].count.sum(axis=0)
     rms = [
         np.sqrt(np.nansum(found.mse * found.count, axis=0) / np.maximum(count, 1))
@@ -103,17 +102,65 @@ def judged(
         )
         if n
     )
-    whole = all(n == len(trial.time) for trial, n in zip(trials, rows, strict=True))
-    return MeasuredStart(tuple(gains), {trial.name: trial.duration for trial in held}, whole)
+    whole = all(rows.get(trial.name) == len(trial.time) for trial in trials)
+    seconds = {t.name: float(t.time[rows[t.name] - 1]) for t in trials if t.name in rows}
+    return MeasuredStart(tuple(gains), seconds, whole)
 
 
-def _held(trial: Trial, rows: int) -> Trial:
-    """The first rows of a trial, with its angles at the start as measured."""
+def carried(trials: Sequence[Trial], before: Fit) -> dict[str, int]:
+    """Rows for which measured angles carry each trial; those that they carry nowhere are left out.
+
+    Args:
+        trials: Records.
+        before: Score on them of the model whose error says how far.
+    """
+    rows = {trial.name: _carries(before, i, trial) for i, trial in enumerate(trials)}
+    return {t.name: rows[t.name] for t in trials if rows[t.name] >= SHORTEST * len(t.time)}
+
+
+def from_measured_angles(
+    body: Mechanism, trials: Sequence[Trial], fit: Fit, rows: Mapping[str, int]
+) -> list[Trial]:
+    """The first rows of trials, starting where the sensors of a model read what was measured.
+
+    A model whose encoder is off, or reads late, starts beside the reading by as much.
+
+    Args:
+        body: The mechanism.
+        trials: Records.
+        fit: Score of the model on them.
+        rows: Of each, how many (`carried`).
+    """
+    return [
+        _held(trial, rows[trial.name], _misread(body, fit, i, trial))
+        for i, trial in enumerate(trials) if trial.name in rows
+    ]  # fmt: skip
+
+
+def _misread(body: Mechanism, fit: Fit, i: int, trial: Trial) -> np.ndarray:
+    """By how much a model's sensors make the free coordinates of a start appear larger, (m,)."""
     free = len(trial.motion) // 2
+    matrix = sensor_matrix(body, trial.setup)
+    first = predict(fit.model, trial, fit.motions[i], fit.refinement)[0]
+    error = first - matrix @ fit.motions[i][: 2 * free]
+    angles = np.array([not unit.endswith('/s') for unit in body.output_units])
+    # Channels without samples say nothing of where it was.
+    angles &= np.isfinite(trial.outputs).any(axis=0)
+    weight = 1 / trial.sigma[angles]
+    shift, *_ = np.linalg.lstsq(
+        matrix[angles, :free] * weight[:, None], error[angles] * weight, rcond=None
+    )
+    return shift
+
+
+def _held(trial: Trial, rows: int, misread: np.ndarray) -> Trial:
+    """The first rows of a trial, with its angles at the start as measured."""
+    free = len(misread)
+    motion = np.concatenate([trial.motion[:free] - misread, trial.motion[free:]])
     sigma = np.concatenate([np.full(free, HELD), trial.motion_sigma[free:]])
     return replace(
         trial, time=trial.time[:rows], inputs=trial.inputs[:rows], outputs=trial.outputs[:rows],
-        motion_sigma=sigma,
+        motion=motion, motion_sigma=sigma,
     )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ NOTE = Mapping({
     'model_file': Key(Text(), default=''),
     'model_sha256': Key(Text(), default=''),
     'software': Key(Text(), default=''),
+    'recording': Key(Text(), default=''),
     'closed_loop': Key(Flag(), default=False),
     'notes': Key(Text(), default=''),
     'imported_from': Key(Mapping({}, further=True), default={}),

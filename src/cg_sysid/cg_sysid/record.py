@@ -32,8 +32,8 @@ class Record:
         mechanism: Name of the mechanism (channels.py).
         setup: What was done to the rig.
         note: The recording note as read.
-        source: Path that the record was read from, or the record that it was cut from; empty if it
-            was made in memory.
+        source: The recording that its note names, or the path that it was read from, or the record
+            that it was cut from; empty if it was made in memory.
         since: Time in s from the first row of what it was cut from to its own.
     """
 

@@ -113,11 +113,10 @@ class Unmodelled:
             factor, unit = scaled(max(map(abs, shape.stretch)), self.variable_unit)
             low, high = (number(factor * end, 2) for end in shape.stretch)
             found.append(f'mostly from {low} to {high} {unit}')
-        return [
-            *found,
-            f'{_quantity(shape.rms, self.effect.unit)} RMS and '
-            f'{_quantity(shape.peak, self.effect.unit)} at most',
-        ]
+        peak = f' and {_quantity(shape.peak, self.effect.unit)} at most'
+        if not shape.peak:
+            peak = ', its size sure nowhere'
+        return [*found, f'{_quantity(shape.rms, self.effect.unit)} RMS{peak}']
 
 
 def _quantity(value: float, unit: str) -> str:

@@ -23,6 +23,7 @@ from cg_sysid.importing import import_logs, import_to_bags
 from cg_sysid.noise import measure_noise
 from cg_sysid.record import NS_PER_S
 from cg_sysid.tables import read_table
+from cg_sysid.trial import recording_of
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DATA = Path(os.environ.get('CG_DATA', REPOSITORY.parent / 'shared' / 'data'))
@@ -153,6 +154,15 @@ def test_each_value_of_a_column_gets_its_own_record(tmp_path):
         np.testing.assert_array_equal(record.inputs['torque'], 10 * k + np.arange(2, 7))
         np.testing.assert_array_equal(np.diff(record.stamp_ns), 5_000_000)
     assert records[0].stamp_ns[0] == 1_299_232_800 * NS_PER_S + 10_000_000
+
+
+def test_pieces_of_one_recording_say_so_in_their_bags(tmp_path):
+    """They share zeros, and never judge each other where other recordings can."""
+    split = {'by': ['trial'], 'name': 'trial_{trial:02d}', 'recording': 'all'}
+    bags = import_to_bags(write_mapping(tmp_path, split=split), tmp_path, tmp_path / 'bags')
+    records = [read_bag(bag) for bag in bags]
+    assert {recording_of(record) for record in records} == {'all'}
+    assert [r.name for r in records] == ['trial_00', 'trial_01', 'trial_02']
 
 
 def test_rows_can_be_chosen_and_time_can_be_a_rate(tmp_path):

@@ -2,7 +2,7 @@
 
 from cg_sysid.report.markup import Markup, column, row, tag, wide
 from cg_sysid.report.wording import Facts, input_units, setup_words
-from cg_sysid.text import effect_name, listed, number, plain_unit, scaled
+from cg_sysid.text import effect_name, listed, number, plain_unit, scaled, sentence
 
 ROLES = {'held': 'held out', 'train': 'fitted', 'all': 'fitted'}
 
@@ -14,6 +14,7 @@ def recordings(facts: Facts) -> Markup | None:
     return tag('section',
         tag('h2', 'Recordings', id='data-title'),
         _records(facts),
+        _windows(facts),
         _noise(facts),
         tag('h3', 'What the check says', style='margin-top:22px') if facts['sources'] else None,
         [_source(s) for s in facts['sources']],
@@ -41,6 +42,13 @@ def _records(facts: Facts) -> Markup | None:
         for r in facts['records']
     ]  # fmt: skip
     return wide('Records', tag('table', tag('thead', head), tag('tbody', rows)))
+
+
+def _windows(facts: Facts) -> Markup | None:
+    windows = facts.get('windows')  # not in files of before
+    if not windows or not facts['records']:
+        return None
+    return tag('p', tag('b', 'Windows '), sentence(windows['text']), style='margin-top:12px')
 
 
 def _error(error: Facts | None, unit: str) -> str:
