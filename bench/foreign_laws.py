@@ -8,7 +8,7 @@ library's effects are named after, and half by what other simulators and the lit
     FRICTIONS   dry friction of sound robots, by the laws of other simulators
     UNLISTED    what no effect of the library is
 
-Not here: feet that roll or give way and springs that harden, which this robot does not have, and
+Not here: feet that roll, and springs of the rig that harden, which this robot does not have; nor
 `boom_mass`: to an engine a mass is a mass.
 """
 
@@ -51,6 +51,25 @@ class Secret:
     command: Callable[[np.ndarray, float], np.ndarray] = lambda torque, dt: torque
     read: Callable[[Channels, np.ndarray], Channels] = lambda channels, time: channels
     step: float = SAMPLE / FINE
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a law may know of the robot and of the recording.
+
+    Attributes:
+        leg_length: In m.
+        index: Number of the recording, from 0.
+        pushed: Number of the one with the push, if there is one.
+        begin: Time of its start in the session, s.
+        rng: Of what is random in the law.
+    """
+
+    leg_length: float
+    index: int
+    pushed: int
+    begin: float
+    rng: np.random.Generator
 
 
 def dry(level: Callable) -> Secret:
@@ -173,25 +192,6 @@ def jittered(c: Channels, time: np.ndarray, sigma: float, rng: np.random.Generat
     """Channels that were sampled off their stamps by `sigma` in s."""
     off = np.repeat(rng.normal(0.0, sigma, -(-len(time) // FINE)), FINE)[: len(time)]
     return {name: np.interp(time + off, time, x) for name, x in c.items()}
-
-
-@dataclass(frozen=True)
-class Machine:
-    """What a law may know of the robot and of the recording.
-
-    Attributes:
-        leg_length: In m.
-        index: Number of the recording, from 0.
-        pushed: Number of the one with the push, if there is one.
-        begin: Time of its start in the session, s.
-        rng: Of what is random in the law.
-    """
-
-    leg_length: float
-    index: int
-    pushed: int
-    begin: float
-    rng: np.random.Generator
 
 
 LAGS = 'actuator_delay', 'sensor_delay'  # one and the same but for the first moments of a record

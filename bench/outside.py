@@ -19,7 +19,8 @@ dry friction that turns twice as fast.
     unlisted   something that no effect of the library is        20
 
 What is right was settled before any was run. single: the first cause is the effect, or one that
-foreign_laws.RIGHT has for that law. pair: the causes are the two, and no third. sound: no cause.
+foreign_laws.RIGHT has for that law. pair: the causes are the two, and no third. sound: no cause
+(how many are told `unexplained` all the same stands below the table).
 unlisted: no cause, or those that are named are not all (`unexplained`).
 
 Every case is one line of --raw, with the version of the sources that made it; a case that is
@@ -34,7 +35,6 @@ import math
 import os
 import resource
 import sys
-import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
@@ -261,13 +261,14 @@ def run(case: Case, version: str, limit: float) -> dict[str, Any]:
     """One line of the raw results."""
     about = {'case': case.name, 'group': case.group, 'version': version, 'laws': case.laws,
              'friction': case.friction, 'faults': case.faults}  # fmt: skip
+    nominal, records, values = records_of(case)
+    cpu = cpu_seconds()
     try:
-        nominal, records, values = records_of(case)
-        began, cpu = time.monotonic(), cpu_seconds()
         found = diagnose(nominal, records, Options(workers=1), deadline=Deadline(limit))
-    except Exception:
+    except Exception:  # whatever a diagnosis dies of is a wrong answer, and not the bench's end
         return about | {'verdict': 'failed', 'why': traceback.format_exc(limit=-3), 'causes': [],
-                        'rivals': [], 'inside': [], 'values': {}}  # fmt: skip
+                        'rivals': [], 'inside': [], 'values': values,
+                        'cpu_s': round(cpu_seconds() - cpu, 1)}  # fmt: skip
     described = found.unmodelled.explained if found.unmodelled else 0.0
     return about | {
         'values': values,
@@ -288,7 +289,6 @@ def run(case: Case, version: str, limit: float) -> dict[str, Any]:
         ],
         'summary': found.summary,
         'cpu_s': round(cpu_seconds() - cpu, 1),
-        'wall_s': round(time.monotonic() - began, 1),
     }  # fmt: skip
 
 
@@ -358,6 +358,14 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
         lines += ['', f'{sum(inside)} of {len(inside)} parameters of right causes lie inside '
                   f'their 95 % interval ({low:.0%} to {high:.0%}), where the law is the '
                   "library's."]
+    sound = [row for row in rows if row['case'].startswith('sound')]
+    astray = sum(row['verdict'] == 'unexplained' for row in sound)
+    described = [row.get('described', 0.0) for row in rows if row['group'] == 'unlisted']
+    if sound:
+        lines += ['', f'Sound machines told `unexplained` all the same: {astray} of {len(sound)}.']
+    if described:
+        shares = ', '.join(f'{share:.0%}' for share in described)
+        lines += ['', f'Share of the error that a learned term takes, unlisted: {shares}.']
     lines += ['', f'All {len(rows)} cases: CPU time median {np.median(cpu):.0f} s, 95 % '
               f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, compilation included; '
               f'{sum(row["verdict"] == "unfinished" for row in rows)} without an end.']
@@ -398,11 +406,12 @@ def version_of_sources() -> str:
     return digest.hexdigest()[:12]
 
 
-def known_rows(raw: Path, version: str) -> dict[str, dict[str, Any]]:
-    """Rows of this version, by case."""
+def known_rows(raw: Path, version: str | None) -> dict[str, dict[str, Any]]:
+    """Rows of a version, of the last one there by default, by case."""
     if not raw.exists():
         return {}
     rows = [json.loads(line) for line in raw.read_text().splitlines()]
+    version = version or rows[-1]['version']
     return {row['case']: row for row in rows if row['version'] == version}
 
 
@@ -424,7 +433,7 @@ def main() -> int:
     parser.add_argument('--limit', type=float, default=LIMIT, help=f's a case [{LIMIT:g}]')
     parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'outside.jsonl')
     parser.add_argument('--write', type=Path)
-    parser.add_argument('--table-only', action='store_true', help='run nothing')
+    parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     options = parser.parse_args()
     version, cases = version_of_sources(), programme()
     if options.case:
@@ -437,7 +446,7 @@ def main() -> int:
         print(json.dumps(row, indent=1), 'right' if is_right(row) else 'wrong', sep='\n')
         return 0
     chosen = sampled(cases, options.sample) if options.sample else cases
-    rows = known_rows(options.raw, version)
+    rows = known_rows(options.raw, None if options.table_only else version)
     missing = [case for case in chosen if case.name not in rows and not options.table_only]
     options.raw.parent.mkdir(parents=True, exist_ok=True)
     for done, row in enumerate(carried_out(missing, version, options.workers, options.limit), 1):
@@ -456,12 +465,13 @@ def main() -> int:
         count = Counter(case.kind for case in cases)
         what = ', '.join(f'{n} {kind}' for kind, n in count.items())
         drawn = f', {len(made)} of them run' if len(made) < len(cases) else ''
+        sample = f' --sample {options.sample}' if options.sample else ''
         options.write.write_text('\n'.join([
             '# Machines that share no code with the models', '',
-            f'Command: `./cg exec python bench/outside.py'
-            f'{f" --sample {options.sample}" if options.sample else ""} --write FILE`, sources '
-            f'{version}. The programme: {what}{drawn}. What is right is written at the head of '
-            'the bench, and was settled before any case was run.', '', *lines, '',
+            f'Command: `./cg exec python bench/outside.py{sample}`; this table of its rows: the '
+            f'same with `--table-only --write FILE`. Sources {made[0]["version"]}.',
+            f'The programme: {what}{drawn}. What is right is written at the head of the bench, '
+            'and was settled before any case was run.', '', *lines, '',
         ]))  # fmt: skip
     return 0
 

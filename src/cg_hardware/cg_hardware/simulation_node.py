@@ -376,14 +376,11 @@ class SimulationNode(LifecycleNode):
         self._awaiting = True
         self._held_back = False
         now = time.monotonic()
-        self._wait = self._longest_wait()
-        self._deadline = now + self._wait
-        self._repeat_at = now + REPEAT
-
-    def _longest_wait(self) -> float:
         # A peer that plans or loads before it controls takes as long to begin as one that starts.
         begins = self.ticks == 0
-        return self.settings.peer_timeout if begins else self.settings.answer_timeout
+        self._wait = self.settings.peer_timeout if begins else self.settings.answer_timeout
+        self._deadline = now + self._wait
+        self._repeat_at = now + REPEAT
 
     def _answered(self) -> None:
         """Apply what the gate makes of the answer, and go on."""

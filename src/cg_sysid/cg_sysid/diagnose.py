@@ -67,6 +67,7 @@ from cg_sysid.imperfections import (
     with_imperfections,
 )
 from cg_sysid.jury import (
+    ACCOUNTS,
     COARSE_FIDELITY,
     EARNED,
     MATERIAL,
@@ -101,13 +102,12 @@ DEEPER = 3  # times that a base is asked for deeper minima
 REVIEWS = 4  # passes of doubt over what was accepted
 PROPOSED = 3  # experiments named for each cause with rivals
 MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
-ACCOUNTS = 0.5  # of the squared error above the noise: causes that take less do not explain it
 SHOWS = 3.0  # standard deviations from which a small fault is there at all
 LEVEL = 1.0  # squared standard deviations within which two fits say the same of all data
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
-QUARTERS = (0.0, 1.57, 3.14, -1.57)  # rad, from one of which a wave is found
+QUARTERS = np.pi * np.array([0.0, 0.5, 1.0, -0.5])  # rad, from one of which a wave is found
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults

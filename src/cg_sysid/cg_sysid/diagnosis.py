@@ -14,7 +14,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.advice import Proposal
 from cg_sysid.experiments import Experiment
-from cg_sysid.gain import Gain
+from cg_sysid.gain import NO_GAIN, Gain
 from cg_sysid.identify import Fit
 from cg_sysid.landed import Landings
 from cg_sysid.measured_start import MeasuredStart
@@ -26,7 +26,6 @@ from cg_sysid.unmodelled import NOTHING, Unmodelled
 from cg_sysid.wandering import Wandering
 
 MOST_ROUNDS = 4
-NO_GAIN = 1.1  # times the error after, below which the error before is the same
 INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 MOST_TOLD = 3  # events of single records in the summary
 CERTAIN = 30.0  # nats: odds of 1e13 to 1, beyond what a noise floor a little off could feign

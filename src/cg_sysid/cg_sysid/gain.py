@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+NO_GAIN = 1.1  # times the error after, below which the error before is the same
+
 
 @dataclass(frozen=True)
 class Gain:

@@ -42,7 +42,7 @@ AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
 SHORTEST_BLOCK_S = 0.1
-HALVED = 0.5  # of the squared error above the noise; who takes more of it is surely there
+ACCOUNTS = 0.5  # of the squared error above the noise: who takes less does not explain it
 MISHAP = 1 / 3  # of the error above the noise: what single mishaps leave at most, if they are it
 SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
 BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
@@ -196,7 +196,7 @@ class Jury:
         own = own_parameters(o)
         reasons += at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
-        if at_noise(base) or left > HALVED or not _known_at_all(o):
+        if at_noise(base) or left > 1 - ACCOUNTS or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
         reasons += as_sound_robots(o.label, own)
         return Candidate(
@@ -240,7 +240,7 @@ def share_explained(before: Fit, after: Fit) -> float:
 
 
 def _known_at_all(o: Outcome) -> bool:
-    """Whether the size of an effect is more than its own standard deviation."""
+    """Whether the first parameter of an effect, its size, exceeds its standard deviation."""
     size, sigma, _ = next(iter(own_parameters(o).values()), (0.0, np.inf, ''))
     return abs(size) > sigma
 

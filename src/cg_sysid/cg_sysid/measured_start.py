@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cg_dynamics.mechanisms.mechanism import Mechanism
-from cg_sysid.gain import Gain
+from cg_sysid.gain import NO_GAIN, Gain
 from cg_sysid.identify import Fit, predict, score
 from cg_sysid.text import listed
 from cg_sysid.trial import Trial, sensor_matrix
@@ -24,7 +24,6 @@ from cg_sysid.trial import Trial, sensor_matrix
 OWN_PART = 0.5  # of the nominal model's error, that the noise of the start may make
 SHORTEST = 0.05  # of a record; if the start carries no further, it judges nothing
 SHORTER = 0.8  # times as long is tried next
-NO_GAIN = 1.05  # times the error after, below which the error before is the same
 HELD = 1e-9  # rad (m where a joint slides), by which a start that is held may move
 
 
