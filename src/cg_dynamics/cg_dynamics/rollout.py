@@ -130,11 +130,13 @@ class NativeRollout:
         if lanes.late >= 0:
             chain[:, lanes.late, delay_column] = 1.0
         chain[0, : self.nx] = S0
-        for w in range(1, lanes.count):
-            chain[w, : self.nx] = handed[w - 1] @ chain[w - 1]
         used = slice(lanes.count)
-        H += (chain.transpose(0, 2, 1) @ hessian[used] @ chain).sum(axis=0)
-        g += np.einsum('wkc,wk->c', chain, gradient[used])
+        # Sensitivities of a motion that runs away do so too; whoever fits sees it by these sums.
+        with np.errstate(over='ignore', invalid='ignore'):
+            for w in range(1, lanes.count):
+                chain[w, : self.nx] = handed[w - 1] @ chain[w - 1]
+            H += (chain.transpose(0, 2, 1) @ hessian[used] @ chain).sum(axis=0)
+            g += np.einsum('wkc,wk->c', chain, gradient[used])
         if Jacobian is not None and by_lane is not None:
             for w in range(lanes.count):
                 first = lanes.first[w]
