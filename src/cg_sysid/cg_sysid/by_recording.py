@@ -18,6 +18,7 @@ from cg_dynamics.model import Model
 from cg_sysid.candidates import Outcome, candidates_for, started_from
 from cg_sysid.identify import Fit, fit
 from cg_sysid.imperfections import turning
+from cg_sysid.jury import AT_NOISE
 from cg_sysid.trial import Trial
 from cg_sysid.unknowns import IdentificationError, own_unknowns
 from cg_sysid.wandering import Wandering
@@ -48,10 +49,13 @@ def what_wanders(
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     numbers = list(numbers_of(o.train.model, trials, names))
-    arguments = [(o, *number, trials, start) for number in (('', None), *numbers)]
-    base, *found = run(_fit_with_own, arguments, 'recording by recording')
-    if isinstance(base, str):
+    base = run(_fit_with_own, [(o, '', None, trials, start, np.inf)], 'all recordings as one')[0]
+    if isinstance(base, str) or base.normalised_error < AT_NOISE:
         return None
+    # Who leaves more is neither named nor in the way of another.
+    reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
+    arguments = [(o, *number, trials, start, reach) for number in numbers]
+    found = run(_fit_with_own, arguments, 'recording by recording')
     fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
     if not fits:
         return None
@@ -99,7 +103,7 @@ def numbers_of(
 
 
 def _fit_with_own(
-    o: Outcome, name: str, at: str | None, trials: Sequence[Trial], start: Fit
+    o: Outcome, name: str, at: str | None, trials: Sequence[Trial], start: Fit, reach: float
 ) -> Fit | str:
     """A fit to all records where every recording has its own size of the effect that is named."""
     model = with_own(o.model, name, at, o.train.model) if name else o.model
@@ -107,7 +111,7 @@ def _fit_with_own(
     try:
         found = fit(
             model, trials, start=started_from(start, model, bounds), own=o.events, bounds=bounds,
-            iterations=ITERATIONS,
+            iterations=ITERATIONS, reach=reach,
         )  # fmt: skip
         return replace(found, model=o.model)  # a class made here does not leave this process
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:

@@ -34,6 +34,8 @@ STRAINED = 4.0  # tolerances from which a number is not what the model file beli
 TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none at all
 SURE = 5.0  # standard deviations from which an event of a record is not chance
 
+Start = tuple[Model, Fit | None]
+
 
 @dataclass(frozen=True, eq=False)
 class Task:
@@ -199,16 +201,17 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
         }
         if eventful(task):
             known = seek_events(best.model, held, label, known, _surest(best, label))
+        unseen = _unseen_shapes(best)
         held_score = score(
-            best.model, held, own=known, thorough=task.thorough, reach=task.reach
-        )
+            best.model, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
+            task.thorough, task.reach,
+        )  # fmt: skip
         events = best.own_by_name(train) | held_score.own_by_name(held)
         model = believing(best.model, task.model, label)
         residuals = tuple(
-            (predict(best.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
-            for trial, motion in zip(
-                (*train, *held), (*best.motions, *held_score.motions), strict=True
-            )
+            (predict(found.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
+            for found, trials in ((best, train), (held_score, held))
+            for trial, motion in zip(trials, found.motions, strict=True)
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
@@ -262,6 +265,15 @@ def _surest(found: Fit, label: str) -> list[np.ndarray]:
     ]
     order = sorted(range(len(own)), key=lambda i: -sure[i])
     return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
+
+
+def _unseen_shapes(found: Fit) -> tuple[str, ...]:
+    """Shapes of events of which no record of a fit had one: only other records can tell."""
+    return tuple(
+        u.name for effect in found.model.effects for u in found.unknowns
+        if effect.name in LIBRARY and any(p.each == 'record' for p in effect.parameters)
+        and u.name.startswith(f'{effect.label}.') and not _surest(found, effect.label)
+    )  # fmt: skip
 
 
 def cost_of(task: Task) -> int:
@@ -357,13 +369,19 @@ def eventful(task: Task) -> bool:
 
 
 def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
-    """Fits to a glimpse from every start: the best, and others that differ from it."""
+    """Fits to a glimpse from every start: the best, and others that differ from it.
+
+    From the task's leads, where it has some: looks at the same beside other small faults.
+    """
     models = list(_starting_models(task))
-    kept = _swept(models[0])
-    looks = _looks(task, models, train, kept)
+    starts: list[Start] = [(model, None) for model in models]
+    if task.leads:
+        starts = [(_chosen(models[0], lead), lead) for lead in task.leads]
+    kept = _swept(models[0]) if not task.leads else []
+    looks = _looks(task, starts, train, kept)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
-        looks = _looks(task, [model for _, model in looks[:FOLLOWED]], train, [])
+        looks = _looks(task, [(model, None) for _, model in looks[:FOLLOWED]], train, [])
     leads: list[Fit] = []
     for look, model in looks:
         if not any(one_minimum(look, lead, model.effects[-1].label) for lead in leads):
@@ -419,7 +437,7 @@ def _look(
     return fit(
         model, few, only, horizon=task.first.horizon if task.first else length,
         iterations=SCREEN_ITERATIONS, start=start,
-        own=task.events, bounds=task.bounds, reach=task.reach,
+        own=task.events, bounds=task.bounds, reach=task.reach, sure=False,
     )  # fmt: skip
 
 
@@ -462,15 +480,15 @@ def _swept(model: Model) -> list[str]:
 
 
 def _looks(
-    task: Task, models: Sequence[Model], train: Sequence[Trial], kept: Sequence[str]
+    task: Task, starts: Sequence[Start], train: Sequence[Trial], kept: Sequence[str]
 ) -> list[tuple[Fit, Model]]:
-    """Short fits from each model and where they lead, best first; `kept` stay as they are."""
+    """Short fits from each start and where they lead, best first; `kept` stay as they are."""
     looks = []
-    for model in models:
+    for model, start in starts:
         moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
         only = [name for name in moved if name not in kept] if kept else None
         try:
-            look = _look(task, model, train, only)
+            look = _look(task, model, train, only, start)
             found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
             looks.append((look, model.with_values(found)))
         except IdentificationError as error:
@@ -523,11 +541,7 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
     fitted, if it happened in one, as held-out records take the model's own numbers for certain.
     """
     prefix = f'{label}.'
-    shared = {
-        u.name.removeprefix(prefix): (float(v), float(s), u.unit)
-        for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True)
-        if u.name.startswith(prefix)
-    }
+    shared = shared_parameters(o.train, label)
     own = next((e.parameters for e in o.model.effects if e.label == label), ())
     for p in own:
         chosen = o.model.values[f'{prefix}{p.name}']
@@ -537,6 +551,16 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
     fitted = [events[name] for name in o.trials[0] if name in events]
     surest = max(fitted or events.values(), key=_sureness, default={})
     return {**surest, **shared}
+
+
+def shared_parameters(found: Fit, label: str) -> dict[str, tuple[float, float, str]]:
+    """Those parameters of an effect that all records share: name -> (value, sigma, unit)."""
+    prefix = f'{label}.'
+    return {
+        u.name.removeprefix(prefix): (float(v), float(s), u.unit)
+        for u, v, s in zip(found.unknowns, found.values, found.sigmas, strict=True)
+        if u.name.startswith(prefix)
+    }
 
 
 def events_of(o: Outcome, label: str) -> dict[str, dict[str, tuple[float, float, str]]]:

@@ -40,6 +40,7 @@ from cg_sysid.candidates import (
     fit_to_all,
     one_minimum,
     parameters_of,
+    shared_parameters,
     started_from,
     strained,
 )
@@ -613,7 +614,7 @@ class _Search:
             base, alone = self._led_deeper(base, effects, title)
             self.under_way = base
             outcomes, aside = ([], []) if self._done(base) else self.race.run(
-                alone, effects, title, beaten
+                alone, effects, title, beaten, self.jury.to_be_earned(base)
             )
             contest = self.jury.contest(base, outcomes)
             self.contests[key] = replace(contest, aside=tuple(aside))
@@ -639,7 +640,7 @@ class _Search:
 
     def _done(self, o: Outcome) -> bool:
         """Whether there is nothing to look for on top of this."""
-        return settled(o) and not self.jury.imitated(o)
+        return (settled(o) and not self.jury.imitated(o)) or self.jury.nothing_material(o)
 
     def _alone(self, base: Outcome) -> Task:
         """The task of a base by itself, with its fits."""
@@ -842,7 +843,11 @@ class _Search:
             log.info('%s on all records: %s', cause.label, found)
             return cause
         names = [name for side in final.trials for name in side]
-        return replace(cause, events=events_in(found, names, cause.label))
+        return replace(
+            cause, events=events_in(found, names, cause.label),
+            parameters=cause.parameters | shared_parameters(found, cause.label),
+            undetermined=_undetermined(found, cause.label),
+        )
 
     def _broken_off(self, nominal: Outcome) -> Diagnosis:
         """The best answer before the end, without any fit more."""
@@ -1022,17 +1027,21 @@ def _outstanding(o: Outcome) -> list[str]:
 
 def _as_in(final: Outcome, cause: Cause) -> Cause:
     """The cause with the values of another fit."""
-    prefix = f'{cause.label}.'
     return replace(
         cause,
         parameters=parameters_of(final, cause.label),
         events=events_of(final, cause.label),
-        undetermined=tuple(
-            name.removeprefix(prefix) for name in final.train.undetermined
-            if name.startswith(prefix)
-        ),
+        undetermined=_undetermined(final.train, cause.label),
         replaces=tuple(e.label for e in final.model.effects if _idle(final, cause.label, e.label)),
     )  # fmt: skip
+
+
+def _undetermined(found: Fit, label: str) -> tuple[str, ...]:
+    """Parameters of an effect of which a fit does not even tell the order."""
+    prefix = f'{label}.'
+    return tuple(
+        name.removeprefix(prefix) for name in found.undetermined if name.startswith(prefix)
+    )
 
 
 def _idle(o: Outcome, label: str, other: str) -> bool:

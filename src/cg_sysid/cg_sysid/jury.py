@@ -38,6 +38,8 @@ ROUGH_FIDELITY = 2e-3
 WHITE = 0.9  # share of independent samples from which a residual counts as white noise
 EARNED = 10.0  # nats an effect must gain over the model without it
 MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
+QUIETEST = 0.9  # chi2/N of an output of which nothing is wrong, at least
+HALF_SEEN = 0.3  # of what has to be explained on held-out records, at least on those fitted to
 AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
 SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
 FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
@@ -112,6 +114,7 @@ class Jury:
     def __init__(self, train: Sequence[Trial], held: Sequence[Trial]):
         trials = (*train, *held)
         self.first_held = len(train)
+        self.trials = trials
         self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
         judged = sum(trial.duration for trial in held)
         block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
@@ -199,6 +202,7 @@ class Jury:
         if at_noise(base) or left > 1 - ACCOUNTS or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
         reasons += as_sound_robots(o.label, own)
+        reasons += self._implausible(o)
         return Candidate(
             label=o.label,
             model=o.train.model,
@@ -212,6 +216,19 @@ class Jury:
             reason='; '.join(reasons),
         )
 
+    def _implausible(self, o: Outcome) -> list[str]:
+        """That an effect's values are none of what it is named after."""
+        effect = next((e for e in o.model.effects if e.label == o.label), None)
+        if effect is None or effect.slides(o.model.mechanism):
+            return []
+        prefix = f'{o.label}.'
+        values = {n.removeprefix(prefix): v for n, v in o.train.model.values.items()
+                  if n.startswith(prefix)}  # fmt: skip
+        commands = o.model.mechanism.inputs
+        torque = max(float(np.abs(t.inputs_for(commands)).max()) for t in self.trials)
+        reason = effect.implausible(values, torque)
+        return [reason] if reason else []
+
     def imitated(self, o: Outcome) -> bool:
         """True if small faults come to the noise, and what they leave is none.
 
@@ -219,6 +236,25 @@ class Jury:
         """
         faulty = bool(faults_among(o.model, o.task.bounds))
         return faulty and at_noise(o) and not self._white(o)
+
+    def nothing_material(self, o: Outcome) -> bool:
+        """True if so little is left that nothing could explain MATERIAL of it."""
+        if strained(o) or self.imitated(o):
+            return False  # beliefs decide, or whiteness
+        return bool(per_output(o.held).max() < QUIETEST + MATERIAL**2)
+
+    def to_be_earned(self, base: Outcome) -> float:
+        """chi2/N of training records that a fit on top of a base has to come to, to be earned.
+
+        It has to explain MATERIAL in one output of the records held out. Of those that it is
+        fitted to it explains about as much; where they are almost at the noise, a part of that.
+        """
+        if strained(base) or self.imitated(base):
+            return np.inf
+        count = base.train.count.sum(axis=0)
+        least = MATERIAL**2 * float(count.min() / count.sum())
+        error = base.train.normalised_error
+        return error - HALF_SEEN * min(least, max(error - 1.0, 0.0))
 
     def _white(self, o: Outcome) -> bool:
         return independent_samples(o.residuals, self.steps) > WHITE * samples(o)

@@ -45,7 +45,7 @@ HOPE = 10.0  # times what the last rung gained, from which it may still win
 NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
 FAVOURED = 2.0  # times what the best look leaves above the noise, to be fitted first
 MOST = 3.0  # an error that is so many times smaller is mostly explained
-IDLE = 0.7  # of what the base leaves above the noise: who leaves more explains next to nothing
+IDLE = 0.3  # of what the best explains: who explains less is idle beside it
 MUCH = 1.5  # chi2/N of a model of which much is wrong
 HEAVY = 10  # cost from which a candidate is looked at when the others have been
 FIRST_FEW = 8  # of the light candidates, that may show that the base was in a local minimum
@@ -73,9 +73,15 @@ class Race:
         return self.carry_out(try_candidate, [(t, self.train, self.held) for t in tasks], what)
 
     def look(self, tasks: Sequence[Task], what: str) -> list[Look]:
-        """First looks, without those that failed; what was looked at is known."""
+        """First looks, without those that failed; what was looked at is known.
+
+        Those at the same beside other small faults lead the way.
+        """
         new = [task for task in tasks if _structure(task) not in self.looks]
-        looks = self.carry_out(look_at, [(task, self.train) for task in new], what)
+        before = [self._known_beside(task) for task in new]
+        led = [replace(task, leads=known.task.leads) if known else task
+               for task, known in zip(new, before, strict=True)]  # fmt: skip
+        looks = self.carry_out(look_at, [(task, self.train) for task in led], what)
         for task, look in zip(new, looks, strict=True):
             self.looks[_structure(task)] = look
             if isinstance(look, str):
@@ -99,7 +105,8 @@ class Race:
         return None
 
     def run(
-        self, base: Task, effects: Effects, what: str, beaten: float = np.inf
+        self, base: Task, effects: Effects, what: str, beaten: float = np.inf,
+        earned: float = np.inf,
     ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
 
@@ -108,6 +115,7 @@ class Race:
             effects: Effects and places.
             what: For the progress.
             beaten: chi2/N that is to be beaten, or nearly so.
+            earned: chi2/N that has to be come to (Jury.to_be_earned).
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
@@ -122,13 +130,13 @@ class Race:
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
         known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
-        reach = min(known, worth_having(_smallest(looks), base.first))
+        reach = min(known, worth_having(_clear(_smallest(looks), base.first), base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
         looks += self.look(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (_favoured(_smallest(looks)), np.inf):
             best = _best(found)
-            reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base))
+            reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base), earned)
             fewest = FEWEST if np.isinf(beaten) else 0
             heat = [look for look in _worth_more(looks, reach, base.first, fewest)
                     if look.label not in tried and _known(look) <= limit]  # fmt: skip
@@ -138,17 +146,19 @@ class Race:
         best = min(_best(found), beaten)
         if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
             found |= self._fitted(events, f'{what}, events')
-        found |= self._in_more_depth(found, min(beaten, _error(base.base)), what)
+        found |= self._in_more_depth(found, base.base, beaten, earned, what)
         return list(found.values()), [look.label for look in looks if look.label not in tried]
 
     def _in_more_depth(
-        self, found: Mapping[str, Outcome], beaten: float, what: str
+        self, found: Mapping[str, Outcome], base: Fit | None, beaten: float, earned: float,
+        what: str,
     ) -> dict[str, Outcome]:
         """Ever longer fits of those that may still win."""
-        found = dict(found)
+        found, beaten = dict(found), min(beaten, _error(base))
         gained: dict[str, float] = {}
         for iterations in RUNGS[1:]:
-            going = _may_still_win(found, gained, beaten)
+            limit = min(earned, worth_having(_best(found), base))
+            going = _may_still_win(found, gained, beaten, limit)
             again = self._fitted(
                 [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
@@ -267,11 +277,20 @@ def _favoured(best: float) -> float:
 def worth_having(best: float, base: Fit | None) -> float:
     """chi2/N that a fit on top of a base has to come to, if another came to `best`.
 
-    It has to be below the base's. Where another explains most of what the base leaves above the
-    noise, what explains next to nothing of it can wait for the next round.
+    It has to be below the base's. What explains next to nothing of what another explains can wait
+    for the next round.
     """
-    left = _error(base) - 1
-    return 1 + (IDLE if best - 1 < left / MOST else 1.0) * left
+    error = _error(base)
+    return error - IDLE * (error - best) if best < error < np.inf else error
+
+
+def _clear(best: float, first: Fit | None) -> float:
+    """The error of the best look, if that explains most of what is above the noise there.
+
+    The first seconds of records are not all of them: what explains a little more there says
+    nothing about the others.
+    """
+    return best if best - 1 < (_error(first) - 1) / MOST else np.inf
 
 
 def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
@@ -288,18 +307,18 @@ def _worth_more(
     errors = sorted(filter(np.isfinite, map(_known, looks)))
     if not errors:
         return list(looks)
-    reach = min(reach, IN_REACH * errors[0], worth_having(errors[0], first))
+    reach = min(reach, IN_REACH * errors[0], worth_having(_clear(errors[0], first), first))
     limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
     return [look for look in looks if not look.error > limit]
 
 
 def _may_still_win(
-    found: Mapping[str, Outcome], gained: Mapping[str, float], beaten: float
+    found: Mapping[str, Outcome], gained: Mapping[str, float], beaten: float, worth: float
 ) -> list[Outcome]:
     """Unfinished fits that are near the best, and do not come nearer too slowly."""
     best = min(map(chi2, found.values()), default=0.0)
-    # Where the noise is reached, what did not come below its base in eight iterations will not.
-    limit = beaten / SAME if _best(found) < NOTHING_LEFT else np.inf
+    # What did not come below its base in eight iterations will not.
+    limit = min(worth, beaten / SAME if _best(found) < NOTHING_LEFT else np.inf)
     going = [
         o for label, o in found.items()
         if not o.train.converged and chi2(o) < IN_REACH * min(best, beaten * samples(o))

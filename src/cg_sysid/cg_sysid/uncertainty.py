@@ -47,6 +47,15 @@ def uncertainty(
     return covariance, information, _own_sigmas(problem, point, covariance, rescale)
 
 
+def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """In place of `uncertainty` where nobody asks for it: NaN, and starts as they are believed."""
+    k = len(problem.unknowns)
+    return (
+        np.full((k, k), np.nan), np.full(k, np.nan),
+        tuple(np.ones_like(own) for own in _unknown(problem)),
+    )  # fmt: skip
+
+
 def _own_sigmas(
     problem: Problem, point: Point, covariance: np.ndarray, rescale: float
 ) -> tuple[np.ndarray, ...]:

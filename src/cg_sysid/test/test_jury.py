@@ -80,3 +80,29 @@ def test_without_all_joint_fits_none_counts(fitted):
     joint = jury.contest(base, twins, [much, 'runs away'])
     assert _apart(joint) == _apart(jury.contest(base, twins))
     assert joint.margin <= jury.contest(base, twins).margin
+
+
+def _leaving(o, train, held):
+    """The outcome with these chi2/N, the same in all outputs."""
+    return replace(
+        o, train=replace(o.train, mse=np.full_like(o.train.mse, train)),
+        held=replace(o.held, mse=np.full_like(o.held.mse, held)),
+    )  # fmt: skip
+
+
+def test_nothing_can_be_earned_where_too_little_is_left(fitted):
+    jury, base, _, _ = fitted
+    assert jury.nothing_material(_leaving(base, 1.0, 1.85))
+    assert jury.nothing_material(_leaving(base, 30.0, 1.85))
+    assert not jury.nothing_material(_leaving(base, 1.0, 1.95))
+    one = _leaving(base, 1.0, 1.0)
+    one.held.mse[:, 1] = 2.1
+    assert not jury.nothing_material(one)
+
+
+def test_what_is_earned_explains_something_of_the_records_that_it_is_fitted_to(fitted):
+    jury, base, _, _ = fitted
+    # One output in three, three tenths of a squared standard deviation.
+    assert jury.to_be_earned(_leaving(base, 9.0, 9.0)) == pytest.approx(8.9, abs=0.01)
+    assert jury.to_be_earned(_leaving(base, 1.1, 9.0)) == pytest.approx(1.07, abs=1e-6)
+    assert jury.to_be_earned(_leaving(base, 0.9, 9.0)) == pytest.approx(0.9, abs=1e-6)

@@ -189,6 +189,6 @@ def _one_after_the_other(function, arguments, what):
 def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):
     base = fit(nominal, _trials(nominal, _machine(nominal), 2.0))
     leaving = replace(base, mse=np.full_like(base.mse, 1.06))
-    assert worth_having(1.05, leaving) == pytest.approx(1.06)
-    assert worth_having(1.01, leaving) == pytest.approx(1 + 0.06 * IDLE)
+    assert worth_having(1.06, leaving) == worth_having(np.inf, leaving) == pytest.approx(1.06)
+    assert worth_having(1.01, leaving) == pytest.approx(1.06 - 0.05 * IDLE)
     assert worth_having(1.01, None) == np.inf

@@ -112,3 +112,27 @@ def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):
     )
     wave = replace(found, shape=replace(shape, mean=0.02))
     assert 'that follows the time of the record: repeating every 0.16 s' in wave.text
+
+
+def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):
+    machine = nominal.with_effect('actuator_lag', time_constant=0.01)
+    trials = prepare(nominal, [
+        rehearse(
+            f'record_{k}', machine, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
+            [lambda t, k=k: 9 * math.sin(2 * math.pi * (0.5 + 0.1 * k + 0.4 * t) * t)], 4.0, 0.004,
+            k,
+        )
+        for k in range(2)
+    ])  # fmt: skip
+    train, held = trials[:1], trials[1:]
+    base, soft = (
+        try_candidate(Task(model, effect, iterations=1), train, held)
+        for model, effect in ((nominal, None), (nominal, ('joint_flexibility', None)))
+    )
+    for stiffness, told in ((1.0, 'winds up by 1.4 turns'), (2.0, '')):
+        name = 'joint_flexibility.stiffness'
+        model = soft.train.model.with_values({name: stiffness})
+        fitted = replace(soft, train=replace(soft.train, model=model))
+        reason = Jury(train, held).judge(base, fitted, gained=1e3).reason
+        assert told in reason
+        assert ('winds up' in reason) == bool(told)

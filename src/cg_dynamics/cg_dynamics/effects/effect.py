@@ -213,6 +213,15 @@ class Effect:
         """Largest torque in N m that it lets through, given its own parameters."""
         return math.inf
 
+    def implausible(self, values: Mapping[str, float], torque: float) -> str:
+        """Why values cannot be of what the effect is named after, in words; '' if they can.
+
+        Args:
+            values: Of its own parameters.
+            torque: Largest that was commanded, in N m.
+        """
+        return ''
+
     def acts(self, values: Mapping[str, float]) -> bool:
         """False if the first parameter has its neutral value, so that nothing happens at all."""
         first = self.parameters[0]

@@ -1,5 +1,6 @@
 """Elastic transmission between motor and joint, as a harmonic drive's flex spline."""
 
+import math
 from typing import ClassVar
 
 import casadi as ca
@@ -49,6 +50,11 @@ class JointFlexibility(Effect):
     def without_states(self, values):
         """The rotor turns with the joint."""
         return {'rotor_inertia': {'inertia': values['rotor_inertia']}}
+
+    def implausible(self, values, torque):
+        """A spring that winds up by more than a turn is no transmission: it makes torque late."""
+        turns = torque / values['stiffness'] / (2 * math.pi)
+        return f'winds up by {turns:.2g} turns, at most one allowed' if turns > 1 else ''
 
     def initial_states(self, angle, rate, torque, p):
         """Wound up by the held torque, moving with the joint."""
