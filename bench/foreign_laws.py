@@ -153,6 +153,17 @@ class Creep:
         return -self.stiffness * (lean - self.crept)
 
 
+def _three(law: Callable[[float, float, float], float]) -> Callable:
+    """A law of time, angle and rate, where there is a load too."""
+    return lambda time, angle, rate, load: law(time, angle, rate)
+
+
+def heated(torque: np.ndarray, dt: float) -> np.ndarray:
+    """A motor whose magnets lose a hundredth of their pull for each 20 (N m)^2 s of heat."""
+    heat = np.cumsum(torque**2) * dt
+    return torque * (1 - 0.01 * heat / 20.0)
+
+
 def triangle(phase: float) -> float:
     """A wave between -1 and 1 with the period and the signs of a sine."""
     return 2 / np.pi * np.arcsin(np.sin(phase))
@@ -251,6 +262,13 @@ LAWS: dict[str, Callable[[Mapping[str, float], Machine], Secret]] = {
     'sensor_delay': lambda v, m: Secret({'sensor_delay': v['delay']}),
     'presliding_friction': lambda v, m: at_hip(
         Bristle(lambda rate: v['torque'], v['torque'] / v['deflection'])),
+    'torque_dead_zone': lambda v, m: Secret(
+        command=lambda u, dt: u - np.clip(u, -v['half_width'], v['half_width'])),
+    'torque_quantisation': lambda v, m: Secret(
+        command=lambda u, dt: v['step'] * np.round(u / v['step'])),
+    'foot_creep': lambda v, m: Secret(
+        {'at_stance': Creep(v['stiffness'], v['time_constant'])}),
+    'joint_creep': lambda v, m: at_hip(_three(Creep(v['stiffness'], v['time_constant']))),
     # Other laws: Tustin's fade, a fade with slow tails, LuGre's bristle.
     'stribeck_friction/exponential': lambda v, m: dry(
         lambda t, angle, rate, load:
@@ -294,6 +312,15 @@ LAWS: dict[str, Callable[[Mapping[str, float], Machine], Secret]] = {
     'actuator_lag/second_order': lambda v, m: Secret(
         command=lambda u, dt: lagged_torque(
             lagged_torque(u, dt, v['time_constant'] / 2), dt, v['time_constant'] / 2)),
+    # A drive that wakes up slowly.
+    'torque_dead_zone/round': lambda v, m: Secret(
+        command=lambda u, dt: np.sign(u) * (np.hypot(u, v['half_width']) - v['half_width'])),
+    'torque_quantisation/towards_zero': lambda v, m: Secret(
+        command=lambda u, dt: v['step'] * np.trunc(u / v['step'])),
+    # Rubber creeps with more than one time constant.
+    'foot_creep/two_constants': lambda v, m: beside(
+        Secret({'at_stance': Creep(v['stiffness'] / 2, v['time_constant'] / 2)}),
+        Secret({'at_stance': Creep(v['stiffness'] / 2, v['time_constant'] * 2)})),
     'actuator_delay/uneven': lambda v, m: Secret(
         command=lambda u, dt: uneven(u, dt, v['delay'], m.rng)),
     'imu_lag/second_order': lambda v, m: Secret(read=lambda c, time: {**c, **{
@@ -316,6 +343,7 @@ RIGHT: dict[str, tuple[str, ...]] = {
     'stribeck_friction/bristle': ('presliding_friction',),
     'joint_flexibility/friction_at_motor': ('motor_side_friction',),
     'actuator_delay/uneven': LAGS,
+    'torque_quantisation/towards_zero': ('torque_dead_zone',),
     'actuator_lag/second_order': LAGS,
 }
 
@@ -332,11 +360,11 @@ FRICTIONS: dict[str, Callable[[], Callable[[float, float, float, float], float]]
 }  # fmt: skip
 
 UNLISTED: dict[str, Callable[[Machine], Secret]] = {
-    'a dead zone of the drive': lambda m: Secret(
-        command=lambda u, dt: u - np.clip(u, -0.5, 0.5)),
-    'a drive that rounds to 0.8 N m': lambda m: Secret(
-        command=lambda u, dt: 0.8 * np.round(u / 0.8)),
-    'a foot pad that creeps': lambda m: Secret({'at_stance': Creep(40.0, 0.6)}),
+    'a motor that fades with its heat': lambda m: Secret(command=heated),
+    'a hip that is stiff one way': lambda m: at_hip(
+        lambda t, angle, rate, load: -8.0 * max(angle, 0.0)),
+    'a gust against the leg that stands': lambda m: Secret({
+        'at_stance': lambda t, angle, rate: 1.2 * np.exp(-(((t - 4) / 0.8) ** 2))}),
     'magnets at the hip': lambda m: at_hip(
         lambda t, angle, rate, load: -1.14 * np.sin(30 * angle)
         * np.exp(3 * (np.cos(30 * angle) - 1))),

@@ -37,7 +37,7 @@ import resource
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -159,18 +159,29 @@ def right_names(law: str) -> tuple[str, ...]:
 
 
 def sampled(cases: list[Case], count: int) -> list[Case]:
-    """Of every kind its share of so many cases, drawn by a seed of its own."""
-    rng = np.random.default_rng(2)
-    chosen = []
-    for kind in KINDS:
+    """Of every kind its share of so many cases, drawn once: a smaller sample is part of a larger.
+
+    In an order in which every beginning has all kinds.
+    """
+    ranked = []
+    for k, kind in enumerate(KINDS):
         own = [case for case in cases if case.kind == kind]
-        share = round(count * len(own) / len(cases))
-        chosen += [own[i] for i in sorted(rng.choice(len(own), share, replace=False))]
-    return chosen
+        order = np.random.default_rng([2, k]).permutation(len(own))
+        ranked += [((rank + 0.5) / len(own), own[i]) for rank, i in enumerate(order)]
+    ranked.sort(key=lambda pair: pair[0])
+    return [case for _, case in ranked[:count]]
 
 
-def records_of(case: Case) -> tuple[Model, list[Record], dict[str, dict[str, float]]]:
-    """The nominal model, the records of the machine, and the hidden values by effect."""
+def records_of(
+    case: Case, names: Sequence[str] = PROGRAMME, seconds: float = SECONDS
+) -> tuple[Model, list[Record], dict[str, dict[str, float]]]:
+    """The nominal model, the records of the machine, and the hidden values by effect.
+
+    Args:
+        case: The machine.
+        names: Experiments, one for each record.
+        seconds: Length of each.
+    """
     file = Model.load(model_path(NOMINAL_MODEL))
     nominal = file.with_values(two_links(file.values))
     rng = np.random.default_rng(case.seed)
@@ -181,19 +192,19 @@ def records_of(case: Case) -> tuple[Model, list[Record], dict[str, dict[str, flo
     listed = [law for law in case.laws if law in LAWS]
     values = {law: draw_values(table[law.partition('/')[0]], rng) for law in listed}
     # Where the leg that stands is held, a push at the hip does nothing.
-    free = [i for i, name in enumerate(PROGRAMME) if load_experiment(name).setup.springs]
+    free = [i for i, name in enumerate(names) if load_experiment(name).setup.springs]
     pushed = int(rng.choice(free))
     records = []
-    for i, experiment in enumerate(PROGRAMME):
+    for i, experiment in enumerate(names):
         machine = Machine(
-            truth['leg_length'], i, pushed, i * (SECONDS + PAUSE), np.random.default_rng(
+            truth['leg_length'], i, pushed, i * (seconds + PAUSE), np.random.default_rng(
                 [case.seed, i]),
         )  # fmt: skip
         secret = own_friction(case, truth)
         for law in case.laws:
             wrong = LAWS[law](values[law], machine) if law in LAWS else UNLISTED[law](machine)
             secret = beside(secret, wrong)
-        records.append(record(experiment, truth, secret, nominal, case, machine))
+        records.append(record(experiment, truth, secret, nominal, case, machine, seconds))
     return nominal, records, {law.partition('/')[0]: v for law, v in values.items()}
 
 
@@ -207,13 +218,13 @@ def own_friction(case: Case, truth: dict[str, float]) -> Secret:
 
 def record(
     experiment: str, truth: dict[str, float], secret: Secret, nominal: Model, case: Case,
-    machine: Machine,
+    machine: Machine, seconds: float = SECONDS,
 ) -> Record:
     """One recording of MuJoCo's robot."""
     e = load_experiment(experiment)
     seed = 100 * case.seed + machine.index
-    signal = make_signal(ExcitationSettings(**e.excitation, duration=SECONDS, seed=seed))
-    rows = round(SECONDS / SAMPLE)
+    signal = make_signal(ExcitationSettings(**e.excitation, duration=seconds, seed=seed))
+    rows = round(seconds / SAMPLE)
     reported = np.array([signal(k * SAMPLE) for k in range(rows)])
     dt = SAMPLE / FINE
     plain = case.friction == 'tanh'

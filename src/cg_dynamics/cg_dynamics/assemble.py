@@ -166,13 +166,17 @@ def assemble(model: Model, setup: Setup) -> Equations:
     for stretch, stiffness in body.springs():
         potential += stiffness * stretch**2 / 2
     force = ca.SX.zeros(q.shape)
+    full = [ca.mtimes(kinematics.basis, s), ca.mtimes(kinematics.basis, ds)]
     for e in effects:
         more_kinetic, more_potential = e.energies(body, own[e.label])
         kinetic, potential = kinetic + more_kinetic, potential + more_potential
-        force += e.force(body, own[e.label])
+        if overrides(e, 'force'):
+            force += pass_through(e, e.force(body, z_of[e.label], own[e.label]))
+            if e.states:
+                lean, rate = full[0][body.stance], full[1][body.stance]
+                starts[e.label] = e.initial_states(lean, rate, ca.SX(0), own[e.label])
     for row, torque in zip(mechanism.joints.values(), torques, strict=True):
         force += ca.DM(row) * torque
-    full = [ca.mtimes(kinematics.basis, s), ca.mtimes(kinematics.basis, ds)]
     kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
     mass_matrix, bias = manipulator(kinetic, potential, s, ds)
     load = ca.mtimes(kinematics.basis.T, force) - bias
@@ -195,7 +199,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
         for channel in outputs:
             late = e.output_delay(channel, own[e.label])
             output_delays[channel] += 0 if late is None else late
-    rates = [dz[e.label] for e in effects if e.states]
+    rates = [ca.substitute(dz[e.label], [q, v], full) for e in effects if e.states]
     return Equations(
         x=x,
         u=u,

@@ -24,6 +24,7 @@ VALUES = {
     'actuator_delay': {'delay': 0.0053},
     'sensor_delay': {'delay': 0.0047},
     'backlash': {'gap': 0.02},
+    'torque_quantisation': {'roundness': 0.5},  # differences need edges that they can resolve
 }
 
 

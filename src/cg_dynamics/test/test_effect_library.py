@@ -42,7 +42,8 @@ CONSERVATIVE = (
 )  # fmt: skip
 DISSIPATIVE = (
     'aerodynamic_drag', 'ankle_friction', 'asymmetric_friction', 'back_emf', 'coulomb_friction',
-    'friction_drift', 'load_dependent_friction', 'position_dependent_friction',
+    'foot_creep', 'friction_drift', 'joint_creep', 'load_dependent_friction',
+    'position_dependent_friction',
     'presliding_friction', 'quadratic_friction', 'spring_damping', 'stribeck_friction',
     'viscous_friction',
 )  # fmt: skip
@@ -215,9 +216,12 @@ def test_friction_never_adds_energy(bare, name):
     model = bare.with_effect(name)
 
     def stored(e):
+        p = dict(zip(e.parameter_names, ca.vertsplit(e.p), strict=True))
+        wound = {'foot_creep': e.x[0], 'joint_creep': e.x[0] - e.x[1]}
+        if name in wound:
+            return p[f'{name}.stiffness'] * (wound[name] - e.x[4]) ** 2 / 2
         if name != 'presliding_friction':
             return 0.0
-        p = dict(zip(e.parameter_names, ca.vertsplit(e.p), strict=True))
         level, deflection = p[f'{name}.torque'], p[f'{name}.deflection']
         return level * deflection * e.x[4] ** 2 / 2
 

@@ -108,7 +108,6 @@ LEVEL = 1.0  # squared standard deviations within which two fits say the same of
 FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
 OUTSTANDING_TIMES = 4  # and as many times its even share
-QUARTERS = np.pi * np.array([0.0, 0.5, 1.0, -0.5])  # rad, from one of which a wave is found
 SMALL_FAULTS = 'small faults'
 Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
@@ -798,18 +797,14 @@ class _Search:
         """
         if term is None or term.period is None:
             return None
-        cycles, size = 2 * np.pi / term.period[0], float(np.ptp(term.shape.value) / 2)
+        period, size = term.period[0], float(np.ptp(term.shape.value) / 2)
         tasks = []
         for name, kind in LIBRARY.items():
-            if kind.family != term.effect.family or kind.wave is None:
-                continue
-            count = next((p for p in kind.parameters if p.name == 'cycles'), None)
-            if count is None or not count.lower <= cycles <= count.upper:
+            if kind.family != term.effect.family:
                 continue
             at = kind(self.nominal.mechanism, term.effect.site).at
-            for turn in QUARTERS:
-                wave = dict(zip(kind.wave, (size, turn), strict=True))
-                model = nominal.task.model.with_effect(name, at, cycles=cycles, **wave)
+            for values in kind.repeating(period, size):
+                model = nominal.task.model.with_effect(name, at, **values)
                 known = replace(term.fit, motions=nominal.train.motions, own=nominal.train.own)
                 start = started_from(known, model, nominal.task.bounds)
                 tasks.append(Task(model, bounds=nominal.task.bounds, leads=(start,)))

@@ -86,7 +86,9 @@ def judged(
     if not rows:
         return None
     scores = [
-        score(fit.model, from_measured_angles(body, trials, fit, rows), own=fit.own_by_name(trials))
+        score(
+            fit.model, from_measured_angles(body, trials, fit, rows), own=fit.own_by_name(trials)
+        )
         for fit in (before, after)
     ]
     count = scores[0].count.sum(axis=0)

@@ -31,6 +31,7 @@ OVERSAMPLED = 2.0  # frequencies of the sweep per width of a spectral line
 PROMISING = 0.95  # share of the error that one wave of a series may leave
 REFINED = 9  # frequencies between two neighbours of the sweep
 MOST_CYCLES = 400.0  # per revolution
+MOST_STEPS = 200  # of a torque, over its range
 FASTEST_HZ = {False: 20.0, True: 60.0}  # in time: of a torque, of a sensor error
 FEWEST_PERIODS = 2.5  # seen in the data; less is a shape, not a repetition
 LONGER = 0.7  # share of the error that a multiple of a period may leave, or else it is not meant
@@ -185,7 +186,7 @@ class Sketches:
         return self._term(effect, fixed, sums, tolerances[best], float(errors[best]))
 
     def _periodic(self, effect: LearnedEffect, span: float) -> list[Term]:
-        frequencies = self._frequencies(span, self._fastest(effect))
+        frequencies = self._frequencies(span, self._fastest(effect, span))
         if not len(frequencies):
             return []
         errors = self._sweep(effect, frequencies)[0]
@@ -241,7 +242,7 @@ class Sketches:
         )
 
     def _vibrating(self, effect: LearnedEffect, span: float) -> list[Term]:
-        frequencies = self._frequencies(span, self._fastest(effect))
+        frequencies = self._frequencies(span, self._fastest(effect, span))
         if not len(frequencies):
             return []
         errors = self._sweep(effect, frequencies)[1]
@@ -252,9 +253,11 @@ class Sketches:
     def _frequencies(self, span: float, fastest: float) -> np.ndarray:
         return np.arange(FEWEST_PERIODS / span, fastest, 1 / (OVERSAMPLED * span))
 
-    def _fastest(self, effect: LearnedEffect) -> float:
+    def _fastest(self, effect: LearnedEffect, span: float) -> float:
         if effect.variable == 'angle':
             return MOST_CYCLES / (2 * np.pi)
+        if effect.variable == 'torque':
+            return MOST_STEPS / span
         step = max(float(np.median(np.diff(trial.time))) for trial in self.trials)
         return min(FASTEST_HZ[isinstance(effect, SensorTerm)], 0.4 / step)
 

@@ -4,7 +4,7 @@ import math
 
 import casadi as ca
 import pytest
-from unlisted import DetentTorque, hide, records
+from unlisted import DetentTorque, ViscoelasticHip, hide, records
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import TIME
@@ -43,6 +43,27 @@ class StraightDrift(DetentTorque):
         return -1.4 * (1 - p[TIME] / 12) * ca.tanh(rate / 0.01), []
 
 
+class DeadZone(DetentTorque):
+    """A drive that does not deliver the first half newton metre."""
+
+    name, place = 'hidden_dead_zone', 'command'
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return ca.SX(0), []
+
+    def deliver(self, torque, z, p):
+        return torque - ca.fmin(ca.fmax(torque, -0.5), 0.5), []
+
+
+class FewBits(DeadZone):
+    """A drive that rounds its command."""
+
+    name = 'hidden_few_bits'
+
+    def deliver(self, torque, z, p):
+        return 0.83 * ca.floor(torque / 0.83 + 0.5), []
+
+
 @pytest.fixture(scope='module')
 def nominal(model_file):
     return Model.load(model_file)
@@ -55,6 +76,9 @@ def nominal(model_file):
         (Triangle, 'cogging_torque', ('torque_bias',)),
         (TenTightPlaces, 'position_dependent_friction', ('asymmetric_friction',)),
         (StraightDrift, 'friction_drift', ('stribeck_friction',)),
+        (DeadZone, 'torque_dead_zone', ('torque_saturation', 'load_dependent_friction')),
+        (FewBits, 'torque_quantisation', ('torque_constant', 'torque_dead_zone')),
+        (ViscoelasticHip, 'joint_creep', ('presliding_friction', 'torque_constant')),
     ],
 )
 def test_a_law_of_another_shape_is_named(nominal, hidden, name, listed):
@@ -67,6 +91,11 @@ def test_a_law_of_another_shape_is_named(nominal, hidden, name, listed):
         # The first wave of a triangle has 8/pi^2 of its height; its third is described.
         assert parameters['cycles'][0] == pytest.approx(CYCLES, rel=0.01)
         assert parameters['amplitude'][0] == pytest.approx(0.8 * 8 / math.pi**2, rel=0.05)
+    sizes = {DeadZone: {'half_width': 0.5}, FewBits: {'step': 0.83},
+             ViscoelasticHip: {'stiffness': 8.0, 'time_constant': 0.3}}  # fmt: skip
+    for parameter, value in sizes.get(hidden, {}).items():
+        # Edges that are round in the law and sharp in the machine take the rest.
+        assert parameters[parameter][0] == pytest.approx(value, rel=0.03)
     if hidden is TenTightPlaces:
         assert parameters['cycles'][0] == pytest.approx(10, rel=0.01)
         assert answer.extended.held.normalised_error < 1.05

@@ -38,14 +38,14 @@ def pulse_of(shape, width, impulse, middle):
         def acts(self, values):
             return True
 
-        def force(self, body, p):
+        def force(self, body, z, p):
             late = (p[TIME] - middle) / width
             if shape == 'rectangle':
                 force = impulse / width
             else:
                 force = math.pi / 2 * impulse / width * ca.cos(math.pi * late)
             hip, _ = body.hip()
-            return ca.gradient(hip[0], body.q) * ca.if_else(ca.fabs(late) < 0.5, force, 0)
+            return ca.gradient(hip[0], body.q) * ca.if_else(ca.fabs(late) < 0.5, force, 0), []
 
     return Pulse
 

@@ -39,22 +39,6 @@ class DetentTorque(Effect):
         return -1.14 * ca.sin(n * angle) * ca.exp(3 * (ca.cos(n * angle) - 1)), []
 
 
-class DeadZone(DetentTorque):
-    """A drive that does not deliver the first half newton metre."""
-
-    name, place = 'hidden_dead_zone', 'command'
-
-    @staticmethod
-    def function(s):
-        return np.clip(-s, -0.5, 0.5)
-
-    def joint_torque(self, angle, rate, load, z, p):
-        return ca.SX(0), []
-
-    def deliver(self, torque, z, p):
-        return torque - ca.fmin(ca.fmax(torque, -0.5), 0.5), []
-
-
 class SoftStop(DetentTorque):
     """A rubber block that the hip runs into at 0.15 rad."""
 
@@ -125,10 +109,10 @@ class CrossFriction(DetentTorque):
     def joint_torque(self, angle, rate, load, z, p):
         return ca.SX(0), []
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         rate = body.v[0] - body.v[1]
         torque = -12 * body.q[1] ** 2 * ca.tanh(rate / 0.01)
-        return ca.vertcat(torque, -torque)
+        return ca.vertcat(torque, -torque), []
 
 
 class FadingMotor(DetentTorque):
@@ -187,14 +171,17 @@ class StiffeningSpring(DetentTorque):
         return -60.0 * angle**3, []
 
 
-class LopsidedDrive(DeadZone):
+class LopsidedDrive(DetentTorque):
     """A drive that gives a sixth more one way and a sixth less the other way."""
 
-    name = 'hidden_lopsided_drive'
+    name, place = 'hidden_lopsided_drive', 'command'
 
     @staticmethod
     def function(s):
         return 0.15 * np.abs(s)
+
+    def joint_torque(self, angle, rate, load, z, p):
+        return ca.SX(0), []
 
     def deliver(self, torque, z, p):
         return torque * (1 + 0.15 * ca.tanh(torque / 0.02)), []
@@ -252,8 +239,8 @@ class Gust(DetentTorque):
     def joint_torque(self, angle, rate, load, z, p):
         return ca.SX(0), []
 
-    def force(self, body, p):
-        return ca.vertcat(0.8 * ca.exp(-(((p[TIME] - 3) / 0.8) ** 2)), 0)
+    def force(self, body, z, p):
+        return ca.vertcat(0.8 * ca.exp(-(((p[TIME] - 3) / 0.8) ** 2)), 0), []
 
 
 class ViscoelasticHip(DetentTorque):
@@ -284,8 +271,6 @@ CASES = (
     Case(DetentTorque, ('cogging_torque', 'position_dependent_friction'),
          'unmodelled_joint_torque_periodic_in_angle', 'joint', 'angle:hip', 'odd', PITCH,
          error=0.14),
-    Case(DeadZone, ('torque_constant', 'torque_saturation', 'load_dependent_friction'),
-         'unmodelled_joint_torque_of_torque', 'torque path', 'torque:hip', 'odd'),
     Case(SoftStop, ('ground_slope', 'payload'),
          'unmodelled_joint_torque_of_angle', 'joint', 'angle:hip'),
     Case(Pulsation, ('torque_bias', 'friction_drift'),
@@ -313,8 +298,6 @@ MORE = (
     Case(SlowMotor, (), 'unmodelled_torque_gain_of_rate', 'torque path', 'rate:hip', 'even'),
     Case(HangingEncoder, (), 'unmodelled_angle_error_of_rate', 'sensor', 'rate:hip_angle', 'odd'),
     Case(Gust, (), 'unmodelled_outer_torque_of_time', 'outside', 'time'),
-    # No function of one variable describes it.
-    Case(ViscoelasticHip, ('torque_constant', 'torque_bias'), '', '', ''),
 )  # fmt: skip
 
 

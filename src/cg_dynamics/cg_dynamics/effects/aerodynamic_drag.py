@@ -27,6 +27,6 @@ class AerodynamicDrag(Effect):
         """The compass gait, whose coordinates are those rates; elsewhere quadratic friction."""
         return ('all',) if mechanism.name == 'compass_gait' else ()
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         """Against the rate of each leg."""
-        return -p['coefficient'] * body.v * ca.fabs(body.v)
+        return -p['coefficient'] * body.v * ca.fabs(body.v), []

@@ -23,8 +23,8 @@ class AnkleFriction(StanceEffect):
         ),
     )  # fmt: skip
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         """Against the rate of the leg that stands."""
         force = ca.SX.zeros(body.q.shape)
         force[body.stance] = -p['coefficient'] * body.v[body.stance]
-        return force
+        return force, []

@@ -31,6 +31,7 @@ Symbols = Mapping[str, ca.SX]
 # N m (N where a joint slides); what a joint of a robot that walks transmits beyond its held torque
 # as a record begins: that which speeds up its rotor, and that which was applied a moment before.
 START_TORQUE = 5.0
+QUARTERS = (0.0, math.pi / 2, math.pi, -math.pi / 2)  # rad, from one of which a wave is found
 SPRING_FIELDS = ('point', 'anchor_x', 'anchor_z', 'stiffness', 'free_length')
 # Extra inputs that are clocks, in s: since the start of the recording, and since that of the first
 # recording of its session.
@@ -222,6 +223,21 @@ class Effect:
         """
         return ''
 
+    @classmethod
+    def repeating(cls, period: float, size: float) -> list[dict[str, float]]:
+        """Values from which its law may repeat like a function that data drew; empty if it cannot.
+
+        Args:
+            period: In the unit of the variable of `family`.
+            size: Half of its range, in the unit of its values.
+        """
+        count = next((p for p in cls.parameters if p.name == 'cycles'), None)
+        cycles = 2 * math.pi / period
+        if cls.wave is None or count is None or not count.lower <= cycles <= count.upper:
+            return []
+        amplitude, phase = cls.wave
+        return [{'cycles': cycles, amplitude: size, phase: turn} for turn in QUARTERS]
+
     def acts(self, values: Mapping[str, float]) -> bool:
         """False if the first parameter has its neutral value, so that nothing happens at all."""
         first = self.parameters[0]
@@ -261,9 +277,9 @@ class Effect:
         """Kinetic and potential energy in J that the effect adds."""
         return ca.SX(0), ca.SX(0)
 
-    def force(self, body: Body, p: Symbols) -> ca.SX:
+    def force(self, body: Body, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
         """Generalised force in N m that the effect adds, shape (n, 1)."""
-        return ca.SX.zeros(body.q.shape)
+        return ca.SX.zeros(body.q.shape), []
 
     def read(
         self, outputs: dict[str, ca.SX], z: list[ca.SX], p: Symbols
@@ -280,7 +296,10 @@ class Effect:
         return law
 
     def initial_states(self, angle: ca.SX, rate: ca.SX, torque: ca.SX, p: Symbols) -> list[ca.SX]:
-        """Extra states at the start of a record, from joint angle, rate and held torque."""
+        """Extra states at the start of a record, from joint angle, rate and held torque.
+
+        Those of a `force` hook get lean and rate of the leg that stands, and no torque.
+        """
         return [ca.SX(0) for _ in self.states]
 
     def start_spreads(self, p: Symbols) -> list[ca.SX]:

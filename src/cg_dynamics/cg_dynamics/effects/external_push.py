@@ -51,7 +51,7 @@ class ExternalPush(StanceEffect):
     extra_inputs = (TIME,)
     largest_step = 0.002
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         """(PUSH) through the hip's Jacobian."""
         late, duration, round_ = p[TIME] - p['instant'], p['duration'], p['roundness']
         edge = 2 * duration * ca.sqrt(3 * round_) / math.pi
@@ -59,4 +59,4 @@ class ExternalPush(StanceEffect):
         rise, fall = (ca.tanh((late + half) / edge) for half in (length / 2, -length / 2))
         pulse = (rise - fall) / (2 * length)
         hip, _ = body.hip()
-        return ca.gradient(hip[0], body.q) * p['impulse'] * pulse
+        return ca.gradient(hip[0], body.q) * p['impulse'] * pulse, []

@@ -18,10 +18,10 @@ class SpringDamping(SpringEffect):
         ),
     )  # fmt: skip
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         """Against the rate of stretch, through its gradient."""
         force = ca.SX.zeros(body.q.shape)
         for stretch, _ in body.springs():
             rate = ca.jtimes(stretch, body.q, body.v)
             force -= p['coefficient'] * rate * ca.gradient(stretch, body.q)
-        return force
+        return force, []

@@ -18,7 +18,7 @@ class TetherForce(StanceEffect):
         ),
     )  # fmt: skip
 
-    def force(self, body, p):
+    def force(self, body, z, p):
         """The force through the hip's Jacobian."""
         hip, _ = body.hip()
-        return ca.gradient(hip[0], body.q) * p['force']
+        return ca.gradient(hip[0], body.q) * p['force'], []

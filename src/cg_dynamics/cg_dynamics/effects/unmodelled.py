@@ -145,14 +145,14 @@ class JointTerm(LearnedEffect):
         s = {'angle': angle, 'rate': rate, 'torque': load}.get(self.variable)
         return self._torque(p[TIME] if s is None else s, rate, load, p), []
 
-    def force(self, body: Body, p: Symbols) -> ca.SX:
+    def force(self, body: Body, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
         """The same where the angle is that of another coordinate."""
         if self.variable != 'body_angle':
-            return super().force(body, p)
+            return super().force(body, z, p)
         joint, _, name = self.site.partition(':')
         row = ca.DM(body.mechanism.joints[joint])
         s = body.q[body.mechanism.coordinates.index(name)]
-        return row * self._torque(s, ca.dot(row, body.v), None, p)
+        return row * self._torque(s, ca.dot(row, body.v), None, p), []
 
 
 class OuterTerm(LearnedEffect):
@@ -165,14 +165,14 @@ class OuterTerm(LearnedEffect):
         """Each leg, and the one that stands; elsewhere joints hold all bodies."""
         return (*mechanism.bodies, 'stance') if mechanism.name == 'compass_gait' else ()
 
-    def force(self, body: Body, p: Symbols) -> ca.SX:
+    def force(self, body: Body, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
         """On that leg's own coordinate."""
         bodies = body.mechanism.bodies
         leg = body.stance if self.site == 'stance' else bodies.index(self.site)
         force = ca.SX.zeros(body.q.shape)
         s = {'angle': body.q[leg], 'rate': body.v[leg]}.get(self.variable)
         force[leg] = self.law(p[TIME] if s is None else s, p)
-        return force
+        return force, []
 
 
 class SensorTerm(LearnedEffect):
@@ -291,6 +291,8 @@ def _kinds(what: str, variable: str) -> tuple[str, ...]:
         return ('smooth', 'periodic', 'vibrating')
     if variable == 'angle' and what in _TURNING:
         return ('smooth', 'periodic')
+    if variable == 'torque' and what == 'joint_torque':
+        return ('smooth', 'periodic')  # a drive that knows steps only
     return ('smooth',)
 
 
