@@ -59,8 +59,9 @@ def pendulum():
         def torque(t, f=f, k=k):
             return 1.5 * math.sin(2 * math.pi * f * t) + 0.7 * math.sin(2 * math.pi * 2.3 * f * t)
 
+        start = [0.2 * k, 0.0]
         records.append(
-            rehearse(f'swing_{k}', machine, Setup(), [0.2 * k, 0.0], [torque], SECONDS, 1 / RATE, k)
+            rehearse(f'swing_{k}', machine, Setup(), start, [torque], SECONDS, 1 / RATE, k)
         )
     return nominal, records
 
@@ -93,7 +94,8 @@ def timed(name: str, workers: int, packages: Path, limit: float) -> dict:
                 command, env=env, capture_output=True, text=True, timeout=limit + 60, check=True
             )
         except subprocess.TimeoutExpired:
-            return {'verdict': 'no answer', 'causes': [], 'wall': limit, 'cpu': limit, 'over': True}
+            return {'verdict': 'no answer', 'causes': [], 'wall': limit, 'cpu': limit,
+                    'over': True}  # fmt: skip
         except subprocess.CalledProcessError as error:
             return {'verdict': 'failed', 'causes': [error.stderr.strip().splitlines()[-1]],
                     'wall': math.nan, 'cpu': math.nan}  # fmt: skip
