@@ -51,13 +51,17 @@ def pendulum():
     from cg_sysid.rehearse import rehearse
 
     nominal = Model.load(model_path('sydney_pendulum'))
-    machine = nominal.with_effect('stribeck_friction', torque=0.2, stribeck_rate=0.4)
+    turning = nominal.values['coulomb_friction.transition_rate']
+    machine = nominal.with_effect(
+        'stribeck_friction', torque=0.02, stribeck_rate=1.0, transition_rate=turning
+    )
     records = []
     for k in range(4):
         f = 0.3 + 0.15 * k
 
         def torque(t, f=f, k=k):
-            return 1.5 * math.sin(2 * math.pi * f * t) + 0.7 * math.sin(2 * math.pi * 2.3 * f * t)
+            turn = 2 * math.pi * f * t
+            return 0.12 * math.sin(turn) + 0.03 * math.sin(2.3 * turn)
 
         start = [0.2 * k, 0.0]
         records.append(

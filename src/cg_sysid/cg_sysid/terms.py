@@ -31,6 +31,7 @@ OVERSAMPLED = 2.0  # frequencies of the sweep per width of a spectral line
 PROMISING = 0.95  # share of the error that one wave of a series may leave
 REFINED = 9  # frequencies between two neighbours of the sweep
 MOST_CYCLES = 400.0  # per revolution
+WHIRLS = 20 * np.pi  # rad, of a joint that turns on and on
 MOST_STEPS = 200  # of a torque, over its range
 FASTEST_HZ = {False: 20.0, True: 60.0}  # in time: of a torque, of a sensor error
 FEWEST_PERIODS = 2.5  # seen in the data; less is a shape, not a repetition
@@ -186,7 +187,7 @@ class Sketches:
         return self._term(effect, fixed, sums, tolerances[best], float(errors[best]))
 
     def _periodic(self, effect: LearnedEffect, span: float) -> list[Term]:
-        frequencies = self._frequencies(span, self._fastest(effect, span))
+        frequencies = self._frequencies(effect, span)
         if not len(frequencies):
             return []
         errors = self._sweep(effect, frequencies)[0]
@@ -242,7 +243,7 @@ class Sketches:
         )
 
     def _vibrating(self, effect: LearnedEffect, span: float) -> list[Term]:
-        frequencies = self._frequencies(span, self._fastest(effect, span))
+        frequencies = self._frequencies(effect, span)
         if not len(frequencies):
             return []
         errors = self._sweep(effect, frequencies)[1]
@@ -250,7 +251,11 @@ class Sketches:
         period = 1 / float(frequencies[best])
         return [Term(effect, {'period': period}, {}, {}, float(errors[best]))]
 
-    def _frequencies(self, span: float, fastest: float) -> np.ndarray:
+    def _frequencies(self, effect: LearnedEffect, span: float) -> np.ndarray:
+        fastest = self._fastest(effect, span)
+        if effect.variable == 'angle' and span > WHIRLS:
+            # Thousands of frequencies would be told apart; what turns on repeats in whole turns.
+            return np.arange(1, fastest * 2 * np.pi + 0.5) / (2 * np.pi)
         return np.arange(FEWEST_PERIODS / span, fastest, 1 / (OVERSAMPLED * span))
 
     def _fastest(self, effect: LearnedEffect, span: float) -> float:
