@@ -18,9 +18,9 @@ from sensor_msgs.msg import JointState
 
 from cg_bringup.balance_run import MACHINE, BalanceOptions, balance_nodes
 from cg_bringup.supervisor import supervised
-from cg_dynamics.domains import own_domain
 from cg_dynamics.rig import STANCES
-from cg_dynamics.ros import MACHINE_QOS
+from cg_interfaces.domains import own_domain
+from cg_interfaces.ros import MACHINE_QOS
 
 
 def run(stance: str, seconds: float) -> tuple[dict[str, str], int, int, str]:

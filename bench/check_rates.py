@@ -23,12 +23,12 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid import spoil
-from cg_sysid.check import check_recording
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.rehearse import rehearse
-from cg_sysid.synthetic import Synthesis, synthesise
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments import fault_injection as spoil
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
 
 SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',
            'swing_outer_fixed')

@@ -17,11 +17,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from cg_description.paths import model_path
-from cg_sysid import importing
-from cg_sysid.bags import read_raw
-from cg_sysid.check import check_recording
-from cg_sysid.faults import fault_signals
-from cg_sysid.importing import import_to_bags
+from cg_sysid.checks.faults import fault_signals
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.records import importing
+from cg_sysid.records.bags import read_raw
+from cg_sysid.records.importing import import_to_bags
 
 # Set: mapping, folder, published model.
 SETS = {

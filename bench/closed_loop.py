@@ -22,14 +22,14 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_estimation.high_gain import HighGainObserver
-from cg_sysid.bags import read_raw, write_bag
-from cg_sysid.check import check_recording
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.identify import fit, score
-from cg_sysid.record import Record
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit, score
+from cg_sysid.records.bags import read_raw, write_bag
+from cg_sysid.records.record import Record
 
 RESULT = Path(__file__).resolve().parent / 'results' / 'closed_loop.md'
 RIGID = Model.load(model_path('compass_gait_mit'))

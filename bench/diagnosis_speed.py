@@ -48,7 +48,7 @@ def pendulum():
     from cg_description.paths import model_path
     from cg_dynamics.model import Model
     from cg_dynamics.rig import Setup
-    from cg_sysid.rehearse import rehearse
+    from cg_sysid.experiments.rehearsal import rehearse
 
     nominal = Model.load(model_path('sydney_pendulum'))
     turning = nominal.values['coulomb_friction.transition_rate']
@@ -74,8 +74,8 @@ def diagnosed(name: str, workers: int) -> None:
     """Carry out one diagnosis and print what it took, as JSON."""
     from outside import cpu_seconds
 
-    from cg_sysid.diagnose import diagnose
-    from cg_sysid.diagnosis import Options
+    from cg_sysid.diagnosis.diagnose import diagnose
+    from cg_sysid.diagnosis.result import Options
 
     nominal, records = records_for(name)
     wall, cpu = time.monotonic(), cpu_seconds()

@@ -33,10 +33,10 @@ from cg_bringup.balance_run import BalanceOptions, balance_nodes
 from cg_bringup.runs import NodeOf
 from cg_bringup.supervisor import supervised
 from cg_description.model_file import write_atomically
-from cg_dynamics.domains import own_domain
-from cg_dynamics.ros import MACHINE_QOS, SENSOR_QOS, to_nanoseconds, to_stamp
-from cg_sysid.experiments import load_experiment
-from cg_sysid.recover import recover
+from cg_interfaces.domains import own_domain
+from cg_interfaces.ros import MACHINE_QOS, SENSOR_QOS, to_nanoseconds, to_stamp
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.records.recover import recover
 
 STALE = 0.02  # s, the watchdog
 SAMPLE = 0.002  # s

@@ -18,12 +18,12 @@ from cg_control.nodes import Nodes
 from cg_control.tracking import LEAST_TURN, TrackingSettings
 from cg_control.virtual_constraints import VirtualConstraints
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.c_compiler import shared_library
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.impact import impact_function
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.vector_code import FLAGS, WIDTH, vector_code, vector_math
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.rollout.compiler import shared_library
+from cg_dynamics.rollout.vector_code import FLAGS, WIDTH, vector_code, vector_math
+from cg_dynamics.walking.impact import impact_function
 from cg_estimation.high_gain import sampled_gain
 
 SAMPLE_TIME = 0.002  # s

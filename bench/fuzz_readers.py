@@ -39,13 +39,13 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_hardware.simulation import read_setup
-from cg_sysid.bags import load_note, parse_note
-from cg_sysid.diagnosis_file import read_facts
 from cg_sysid.errors import RecordingError
-from cg_sysid.excitation import CommandFileError, playback
-from cg_sysid.experiments import ExperimentError, experiments_directory, load_experiment
-from cg_sysid.importing import import_logs, mapping_folder
-from cg_sysid.tables import read_table
+from cg_sysid.experiments.catalogue import ExperimentError, experiments_directory, load_experiment
+from cg_sysid.experiments.excitation import CommandFileError, playback
+from cg_sysid.records.bags import load_note, parse_note
+from cg_sysid.records.importing import import_logs, mapping_folder
+from cg_sysid.records.tables import read_table
+from cg_sysid.report.diagnosis_file import read_facts
 
 OURS = (DocumentError, RecordingError, TrajectoryError, ExperimentError, DynamicsError,
         CommandFileError)  # fmt: skip

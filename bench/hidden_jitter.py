@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from check_rates import SYNTHETIC
 
-from cg_sysid.check import check_recording
-from cg_sysid.synthetic import Synthesis, synthesise
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
 
 RATE = 500.0
 FREE = {'mechanism': 'double_pendulum', 'torque': 'zero', 'bandwidth': 1.0, 'amplitude': 1.5,

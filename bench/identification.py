@@ -21,15 +21,15 @@ from cg_bringup.hidden import perturb
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.identify import fit
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
-from cg_sysid.unknowns import unknowns_of
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.unknowns import unknowns_of
 
 SETUPS = (
     'spring_stabilised_inner',

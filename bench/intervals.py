@@ -22,12 +22,12 @@ from cg_bringup.hidden import hideable_effects
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.candidates import THOROUGH_ITERATIONS
-from cg_sysid.diagnose import led_in, split
-from cg_sysid.identify import fit
-from cg_sysid.imperfections import with_imperfections
+from cg_sysid.diagnosis.diagnose import led_in, split
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
 from cg_sysid.parallel import run_all
-from cg_sysid.trial import prepare
+from cg_sysid.search.candidates import THOROUGH_ITERATIONS
+from cg_sysid.search.nuisance import with_imperfections
 
 SIZES = 1.0, 0.5
 SHORT_OF = 0.8  # of the true values, where the fit sets out

@@ -22,9 +22,9 @@ from walking_records import as_record  # noqa: E402
 from cg_bringup.hidden import perturb  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.model import Model  # noqa: E402
-from cg_sysid.diagnose import diagnose  # noqa: E402
-from cg_sysid.diagnosis import Options  # noqa: E402
-from cg_sysid.phases import cut_steps  # noqa: E402
+from cg_sysid.diagnosis.diagnose import diagnose  # noqa: E402
+from cg_sysid.diagnosis.result import Options  # noqa: E402
+from cg_sysid.stances.phases import cut_steps  # noqa: E402
 
 CASES = {
     'plastic': {},

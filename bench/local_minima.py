@@ -21,9 +21,9 @@ from cg_bringup.hidden import hidden_effects_file
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.candidates import Look, Outcome, Task, look_at, own_parameters, try_candidate
-from cg_sysid.diagnose import RUNGS, split
-from cg_sysid.trial import prepare
+from cg_sysid.diagnosis.diagnose import RUNGS, split
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.search.candidates import Look, Outcome, Task, look_at, own_parameters, try_candidate
 
 LONG_S, SIX = 20.0, PROGRAMME[:6]
 SIZES = (0.5, 1.0, 2.0)

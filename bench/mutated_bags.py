@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cg_description.model_file import write_atomically
-from cg_sysid.bags import read_bag
 from cg_sysid.errors import RecordingError
-from cg_sysid.recover import RecoveryError, contents_of, entries, recover
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.recover import RecoveryError, contents_of, entries, recover
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'src/cg_sysid/test'))

@@ -22,8 +22,8 @@ from cg_estimation.derivative import Derivative
 from cg_estimation.estimator import Estimator, replay
 from cg_estimation.high_gain import HighGainObserver
 from cg_estimation.kalman import ExtendedKalmanFilter, SteadyKalmanFilter
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 
 RESULT = Path(__file__).resolve().parent / 'results' / 'observer.md'
 RIGID = Model.load(model_path('compass_gait_mit'))

@@ -23,10 +23,10 @@ from cg_control.orbit import Orbit, plan_orbit
 from cg_control.orbit_library import OrbitLibrary, orbit_library
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.impact import impact
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.impact import impact
 
 ROBOT = Model.load(model_path('compass_gait_mit'))
 SPEEDS = np.arange(2, 9) * 0.05

@@ -66,11 +66,12 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.deadline import Deadline
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options, effect_name
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.record import Record
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.records.record import Record
+from cg_sysid.search.ranking import effect_name
 
 OFF = ('c1', 'c2', 'c4', 'c5', 'coulomb_friction.torque', 'viscous_friction.coefficient')
 PAUSE = 2.0  # s between two recordings

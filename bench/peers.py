@@ -32,9 +32,9 @@ from peers import Answer, Case, NameCause
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import LEAD_IN_S, diagnose, split
-from cg_sysid.diagnosis import effect_name
-from cg_sysid.trial import prepare
+from cg_sysid.diagnosis.diagnose import LEAD_IN_S, diagnose, split
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.search.ranking import effect_name
 
 EFFECTS = (
     'actuator_delay', 'backlash', 'joint_flexibility', 'coulomb_friction', 'stribeck_friction',

@@ -31,9 +31,9 @@ from cg_control.task import Box, Task
 from cg_control.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 ROBOT = Model.load(model_path('compass_gait_mit'))
 FULL = planning_model(ROBOT)

@@ -25,18 +25,18 @@ import numpy as np
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.bags import read_bag
-from cg_sysid.candidates import believing
-from cg_sysid.check import check_recording
+from cg_sysid.checks.recordings import check_recording
 from cg_sysid.deadline import Deadline
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.following import Windows, followed, windows_of
-from cg_sysid.identify import fit, predict, score
-from cg_sysid.importing import import_to_bags
-from cg_sysid.measured_start import carried, from_measured_angles
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit, predict, score
+from cg_sysid.identification.measured_start import carried, from_measured_angles
+from cg_sysid.identification.windows import Windows, followed, windows_of
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.importing import import_to_bags
+from cg_sysid.search.candidates import believing
 from cg_sysid.text import measured
-from cg_sysid.trial import prepare
 
 BUDGET = 600.0  # s
 

@@ -5,10 +5,10 @@
     python bench/rebalance.py --starts 20        fewer starts
 
 The robot balances on the inner leg, takes a step and is caught on the outer leg, on the exact
-hybrid model (cg_dynamics.hybrid), friction and torque limit included, state known exactly, torque
-held for 4 ms. A start is drawn uniformly from +-(0.06, 0.15) rad of stance and swing leg and
-+-(0.15, 0.3) rad/s of their rates. It counts as rebalanced if, 1.5 s after the nominal end, the
-robot stands on the outer leg within 0.05 rad and 0.2 rad/s, having landed once. Steps shorter
+hybrid model (cg_dynamics.walking.hybrid), friction and torque limit included, state known exactly,
+torque held for 4 ms. A start is drawn uniformly from +-(0.06, 0.15) rad of stance and swing leg
+and +-(0.15, 0.3) rad/s of their rates. It counts as rebalanced if, 1.5 s after the nominal end,
+the robot stands on the outer leg within 0.05 rad and 0.2 rad/s, having landed once. Steps shorter
 than 10 cm do not land: the robot stands on blocks. Every column sees the same starts.
 """
 
@@ -29,12 +29,12 @@ from cg_control.tracking import REMEDIES, TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.rehearse import rehearse
+from cg_dynamics.walking.hybrid import WalkOptions
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 
 ROBOT = Model.load(model_path('compass_gait_mit'))
 TASK = Task(('inner', 'outer'), reach=0.2)

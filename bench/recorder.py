@@ -32,9 +32,9 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from cg_description.model_file import write_atomically
-from cg_dynamics.domains import own_domain
-from cg_dynamics.ros import LATCHED_QOS, MACHINE_QOS, to_stamp
-from cg_sysid.recover import recover
+from cg_interfaces.domains import own_domain
+from cg_interfaces.ros import LATCHED_QOS, MACHINE_QOS, to_stamp
+from cg_sysid.records.recover import recover
 
 RESULT = Path(__file__).resolve().parent / 'results' / 'recorder.md'
 PERIOD = 0.002  # s
@@ -101,7 +101,8 @@ def start(bag: Path) -> tuple[subprocess.Popen, Path]:
     log = bag.with_suffix('.log')
     with log.open('w') as output:
         process = subprocess.Popen(
-            [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p', f'bag:={bag}'],
+            [sys.executable, '-m', 'cg_sysid.records.recorder_node', '--ros-args', '-p',
+             f'bag:={bag}'],
             stdout=output, stderr=output,
         )  # fmt: skip
     return process, log

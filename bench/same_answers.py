@@ -71,7 +71,7 @@ def _write(folder: Path, records) -> None:
     try:
         from cg_sysid.records.bag_writer import write_bag
     except ImportError:
-        from cg_sysid.bag_writer import write_bag
+        from cg_sysid.records.bag_writer import write_bag
     for r in records:
         write_bag(folder / r.name, r)
 

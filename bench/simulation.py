@@ -27,13 +27,13 @@ from scipy.integrate import solve_ivp
 
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import batch_source, simulate_batch
-from cg_dynamics.c_compiler import build, compiler
-from cg_dynamics.compiled import CompiledModel, assemble, compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_dynamics.rollout import states_source, windows_source
-from cg_dynamics.vector_code import FLAGS
+from cg_dynamics.rollout.batch import batch_source, simulate_batch
+from cg_dynamics.rollout.compiled import CompiledModel, assemble, compile_model
+from cg_dynamics.rollout.compiler import build, compiler
+from cg_dynamics.rollout.native import states_source, windows_source
+from cg_dynamics.rollout.vector_code import FLAGS
 
 STEP = 0.002
 ROWS = 501

@@ -33,9 +33,9 @@ from cg_control.task import Box, Task
 from cg_control.tvlqr import Weights, balance_regulator, linearised, riccati
 from cg_description.paths import model_path
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 RESULT = Path(__file__).parent / 'results' / 'trajectories.md'
 ROBOT = Model.load(model_path('compass_gait_mit'))

@@ -22,8 +22,8 @@ from cg_control.surfaces import METHODS, UNITS, phase_of, tube, with_surfaces
 from cg_control.transverse import TRANSVERSE, monodromy, stabilise_transversely
 from cg_control.tvlqr import Weights, stabilise
 from cg_description.paths import model_path
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.model import Model
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 ROBOT = Model.load(model_path('compass_gait_mit'))
 DEMANDS = (

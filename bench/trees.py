@@ -37,10 +37,10 @@ from cg_control.tracking import REMEDIES, Tracker, TrackingSettings
 from cg_control.tvlqr import stabilise
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import Feedback, simulate_batch
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.batch import Feedback, simulate_batch
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 RESULT = Path(__file__).parent / 'results' / 'trees.md'
 ROBOT = Model.load(model_path('compass_gait_mit'))

@@ -32,7 +32,7 @@ from cg_bringup.supervisor import supervised
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_description.model_file import write_atomically
-from cg_dynamics.domains import own_domain
+from cg_interfaces.domains import own_domain
 
 RESULT = Path(__file__).parent / 'results' / 'trees_nodes.md'
 FIGURES = (('lookup', 'us'), ('preview', 'us'), ('answer', 'us'), ('age', 'ms'))

@@ -33,8 +33,8 @@ from cg_control.rollouts import Outcome, follow
 from cg_control.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
+from cg_dynamics.walking.hybrid import WalkOptions
 
 MODEL = Model.load(model_path('tedrake_pendulum'))
 BOX = np.array([np.pi, 20.0])  # rad, rad/s

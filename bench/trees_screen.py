@@ -38,9 +38,9 @@ from cg_control.program import GUESSES, WEAK, Guess, Program
 from cg_control.reach import Screen, cheap
 from cg_control.task import Box, Task
 from cg_description.paths import model_path
-from cg_dynamics.impact import other
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.impact import other
 
 BOX = np.array([0.5, 0.8, 1.5, 4.0])  # rad, rad, rad/s, rad/s
 SEED = 306422

@@ -23,11 +23,11 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.candidates import THOROUGH_ITERATIONS, Task, chi2, try_candidate
-from cg_sysid.diagnose import led_in, split
-from cg_sysid.imperfections import with_imperfections
+from cg_sysid.diagnosis.diagnose import led_in, split
+from cg_sysid.identification.data_set import prepare
 from cg_sysid.parallel import run_all
-from cg_sysid.trial import prepare
+from cg_sysid.search.candidates import THOROUGH_ITERATIONS, Task, chi2, try_candidate
+from cg_sysid.search.nuisance import with_imperfections
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

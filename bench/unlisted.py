@@ -17,8 +17,8 @@ from pathlib import Path
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'src/cg_sysid/test'))
 from unlisted import CASES, MORE, hide, records

@@ -35,13 +35,13 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.high_gain import HighGainObserver
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Diagnosis, Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.phases import Cut, cut_steps
-from cg_sysid.record import Record
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Diagnosis, Options
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.records.record import Record
+from cg_sysid.stances.phases import Cut, cut_steps
 
 NOMINAL = Model.load(model_path('compass_gait_mit'))
 T, EPSILON = 0.002, 0.01  # s

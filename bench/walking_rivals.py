@@ -56,10 +56,10 @@ from cg_control.tvlqr import Weights, stabilise_periodically
 from cg_control.virtual_constraints import VirtualConstraints
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.gait import find_gait
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.walking.gait import find_gait
+from cg_dynamics.walking.hybrid import WalkOptions
 
 ROBOT = Model.load(model_path('compass_gait_mit'))
 SPEEDS, STEP = (0.25, 0.35), 0.3

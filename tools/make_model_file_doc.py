@@ -74,7 +74,7 @@ def table(schema, names) -> list[str]:
 
 def mechanism_section(body) -> list[str]:
     """What a mechanism needs: its parameters and channels."""
-    from cg_sysid.new_model import example_of, input_units
+    from cg_sysid.cli.new_model import example_of, input_units
 
     lines = [
         f'### `{body.name}`',

@@ -11,7 +11,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.trial import Trial
+from cg_sysid.identification.data_set import Trial
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.trial import Trial
-from cg_sysid.unknowns import unknowns_of
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.unknowns import unknowns_of
 from peers import Answer, Case, effects_for
 
 ACCEPTED = 10.0  # fall of BIC

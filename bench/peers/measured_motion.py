@@ -14,7 +14,7 @@ from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.trial import Trial, sensor_matrix
+from cg_sysid.identification.data_set import Trial, sensor_matrix
 
 WINDOW = 31  # samples
 DEGREE = 4

@@ -12,7 +12,7 @@ import numpy as np
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.trial import Trial
+from cg_sysid.identification.data_set import Trial
 
 CHANNELS = ('imu_angle', 'imu_rate', 'hip_angle')
 # Constraint dry friction is linear below a slip rate and constant above; at this width and

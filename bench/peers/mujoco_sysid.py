@@ -16,7 +16,7 @@ from absl import logging
 from mujoco import sysid
 
 from cg_dynamics.model import Model
-from cg_sysid.trial import Trial
+from cg_sysid.identification.data_set import Trial
 from peers import Answer, Case
 from peers.mujoco_natives import Native, natives
 from peers.mujoco_robot import CHANNELS, channels_of, mjcf, put_inertias, soften, start_of

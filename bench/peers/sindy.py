@@ -21,7 +21,7 @@ import pysindy
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.unknowns import unknowns_of
+from cg_sysid.identification.unknowns import unknowns_of
 from peers import Answer, Case, effects_for
 from peers.grey_box import held_error, identify_nominal, minimise
 from peers.measured_motion import Measured

@@ -31,6 +31,7 @@ setup(
         'cg_control',
         'cg_description',
         'cg_dynamics',
+        'cg_interfaces',
         'cg_estimation',
         'cg_hardware',
         'cg_sysid',

@@ -43,6 +43,7 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
+        'cg_interfaces',
         'matplotlib',
         'numpy',
         'scipy',

@@ -38,6 +38,7 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
+        'cg_interfaces',
         'numpy',
         'scipy',
     ],

@@ -38,6 +38,7 @@ setup(
     install_requires=[
         'cg_description',
         'cg_dynamics',
+        'cg_interfaces',
         'numpy',
         'PyYAML',
     ],

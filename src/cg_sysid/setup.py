@@ -13,19 +13,19 @@ NAME = 'cg_sysid'
 # environment of its own, in which rclpy is never found, whatever the shell has sourced.
 TO_OWN_FOLDER = not {'develop', 'install'}.isdisjoint(sys.argv)
 PROGRAMS = [
-    'recover = cg_sysid.recover:main',
-    'import = cg_sysid.importing:main',
-    'check = cg_sysid.check:main',
-    'identify = cg_sysid.identify_cli:main',
-    'diagnose = cg_sysid.diagnose_cli:main',
-    'report = cg_sysid.report_cli:main',
-    'rehearse = cg_sysid.rehearse_cli:main',
-    'new_model = cg_sysid.new_model:main',
-    'frequency_response = cg_sysid.frequency_response:main',
+    'recover = cg_sysid.records.recover:main',
+    'import = cg_sysid.records.importing:main',
+    'check = cg_sysid.checks.recordings:main',
+    'identify = cg_sysid.cli.identify:main',
+    'diagnose = cg_sysid.cli.diagnose:main',
+    'report = cg_sysid.cli.report:main',
+    'rehearse = cg_sysid.cli.rehearse:main',
+    'new_model = cg_sysid.cli.new_model:main',
+    'frequency_response = cg_sysid.identification.frequency_response:main',
 ]
 NODES = [
-    'excitation_node = cg_sysid.excitation_node:main',
-    'recorder_node = cg_sysid.recorder_node:main',
+    'excitation_node = cg_sysid.experiments.excitation_node:main',
+    'recorder_node = cg_sysid.records.recorder_node:main',
 ]
 
 
@@ -54,6 +54,7 @@ setup(
         'casadi',
         'cg_description',
         'cg_dynamics',
+        'cg_interfaces',
         'lz4',
         'matplotlib',
         'mcap',
@@ -68,7 +69,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'cg = cg_sysid.command:main',
+            'cg = cg_sysid.cli.command:main',
             *(PROGRAMS if TO_OWN_FOLDER else []),
             *(NODES if TO_OWN_FOLDER and find_spec('rclpy') else []),
         ],

@@ -24,6 +24,7 @@ from cg_description.paths import model_path
 from cg_dynamics.rig import STANCES
 from cg_dynamics.stop_request import Stopped
 from cg_hardware.standing import Outcome
+from cg_interfaces import topics
 
 ROBOT = 'compass_gait_flexible'
 LEAN = 0.06  # rad
@@ -85,7 +86,7 @@ def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
             'cg_control',
             'balance_node',
             {'model_file': options.model, **rate},
-            (('/torque_command', '/torque_request'),),
+            ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),),
         ),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
         'observer': NodeOf('cg_estimation', 'observer_node', observer | rate),

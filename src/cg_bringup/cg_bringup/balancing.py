@@ -18,8 +18,8 @@ from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimator
 from cg_hardware.safety import GateSettings, TorqueGate
-from cg_sysid.raw import NOTE_FORMAT
-from cg_sysid.record import NS_PER_S, Record
+from cg_sysid.records.raw import NOTE_FORMAT
+from cg_sysid.records.record import NS_PER_S, Record
 
 FALLEN = 0.6  # rad of the stance leg: nothing catches the robot from there
 

@@ -20,12 +20,12 @@ from cg_bringup.hidden import Hidden, hide
 from cg_bringup.runs import NOMINAL_MODEL, Run
 from cg_bringup.supervisor import Supervisor
 from cg_description.paths import model_path
-from cg_dynamics.domains import own_domain
 from cg_dynamics.model import Model
 from cg_dynamics.stop_request import Stopped, stopped_by_signals
-from cg_sysid.diagnosis_file import read_facts
-from cg_sysid.experiments import ExperimentError, load_experiment
+from cg_interfaces.domains import own_domain
+from cg_sysid.experiments.catalogue import ExperimentError, load_experiment
 from cg_sysid.progress import Bars
+from cg_sysid.report.diagnosis_file import read_facts
 
 # The last repeats the first with another excitation.
 PROGRAMME = (
@@ -76,7 +76,7 @@ def diagnose(
     Raises:
         ExperimentError: It failed.
     """
-    analysis = ['cg_sysid.diagnose_cli', '--model', str(nominal), '--out', str(out)]
+    analysis = ['cg_sysid.cli.diagnose', '--model', str(nominal), '--out', str(out)]
     analysis += ['--effects', candidates] if candidates else []
     console.print('[bold]Diagnosing[/] from these bags and the nominal model, nothing else')
     start = time.monotonic()

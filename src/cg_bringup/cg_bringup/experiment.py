@@ -18,7 +18,8 @@ from cg_bringup.runs import MODES, PATIENCE, Run, experiment_nodes
 from cg_bringup.supervisor import ProcessDied, supervised
 from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.stop_request import Stopped
-from cg_sysid.experiments import ExperimentError, experiment_names, load_experiment
+from cg_interfaces import topics
+from cg_sysid.experiments.catalogue import ExperimentError, experiment_names, load_experiment
 from cg_sysid.progress import Bars
 
 RATE_HZ = 500.0
@@ -107,8 +108,9 @@ def check_counts(run: Run) -> dict[str, int]:
         for topic in tree['topics_with_message_count']
     }
     expected = round(run.length * RATE_HZ)
-    sparing = {'/torque_command': 0 if run.mode == 'real_time' else expected, '/experiment': 1}
-    for topic in ('/experiment', '/applied_torque', *counts):
+    commands = 0 if run.mode == 'real_time' else expected
+    sparing = {topics.TORQUE_COMMAND: commands, topics.EXPERIMENT: 1}
+    for topic in (topics.EXPERIMENT, topics.APPLIED_TORQUE, *counts):
         needed = sparing.get(topic, expected)
         if counts.get(topic, 0) < needed:
             raise ExperimentError(

@@ -14,7 +14,7 @@ from cg_description.schema import Anything, ListOf, MapOf
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import ModelError
 from cg_dynamics.model import Model
-from cg_sysid.experiments import ExperimentError
+from cg_sysid.experiments.catalogue import ExperimentError
 
 DRAWS = 200  # attempts to perturb the lumps such that real bodies can have them
 

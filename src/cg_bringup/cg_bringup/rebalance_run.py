@@ -20,6 +20,7 @@ from cg_bringup.verdict import rebalance_verdict
 from cg_control.tracking import REMEDIES
 from cg_description.paths import model_path
 from cg_dynamics.rig import STANCES
+from cg_interfaces import topics
 
 ROBOT = 'compass_gait_flexible'
 
@@ -82,7 +83,7 @@ def rebalance_nodes(options: RebalanceOptions) -> dict[str, NodeOf]:
         **rate,
     }
     observer = {'model_file': options.model}
-    remapped = (('/torque_command', '/torque_request'),)
+    remapped = ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),)
     return {
         MACHINE: NodeOf('cg_hardware', 'simulation_node', machine),
         'trajectory_server': NodeOf('cg_control', 'trajectory_server_node', planner),

@@ -29,6 +29,7 @@ from cg_control.tree_files import tree_path
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_interfaces import topics
 
 STARTS = ('tree', 'upright')
 DRAWS, AT_ONCE = 300, 32  # states tried for one that comes home
@@ -133,7 +134,7 @@ def recover_nodes(options: RecoverOptions) -> dict[str, NodeOf]:
         'tree_controller': NodeOf(
             'cg_control', 'tree_controller_node',
             {'model_file': options.model, 'grown_for': grown_for, **rate},
-            (('/torque_command', '/torque_request'),),
+            ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),),
         ),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', {}),
         'observer': NodeOf('cg_estimation', 'observer_node', observer),

@@ -16,8 +16,8 @@ from cg_dynamics.model import Model
 from cg_estimation.estimator import replay
 from cg_estimation.observer_settings import ObserverSettings, make_estimator
 from cg_hardware.simulation import model_file_of
-from cg_sysid.bags import read_bag
-from cg_sysid.record import Record
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.record import Record
 
 
 def replay_record(

@@ -12,8 +12,8 @@ import yaml
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_hardware.topics import MEASUREMENT, TORQUE_FRAME, joints_of
-from cg_sysid.experiments import Experiment, ExperimentError
+from cg_interfaces import channels
+from cg_sysid.experiments.catalogue import Experiment, ExperimentError
 
 MODES = ('lockstep', 'real_time')
 NOMINAL_MODEL = 'compass_gait_mit'
@@ -87,9 +87,9 @@ def experiment_nodes(run: Run) -> dict[str, NodeOf]:
         **experiment.excitation,
         'duration': run.length,
         'seed': run.seed,
-        'measurement_topic': MEASUREMENT[mechanism],
-        'joints': list(joints_of(mechanism)),
-        'frame_id': TORQUE_FRAME[mechanism],
+        'measurement_topic': channels.mechanism(mechanism).measurement,
+        'joints': list(channels.mechanism(mechanism).joints),
+        'frame_id': channels.mechanism(mechanism).torque.frame_id,
         'listeners': 2,
     }
     machine = {

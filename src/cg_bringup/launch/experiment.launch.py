@@ -13,7 +13,7 @@ from launch import LaunchDescription
 from cg_bringup.launching import description, node_actions, number
 from cg_bringup.runs import MODES, Run, experiment_nodes
 from cg_description.paths import model_path
-from cg_sysid.experiments import experiment_names, load_experiment
+from cg_sysid.experiments.catalogue import experiment_names, load_experiment
 
 ARGUMENTS = {
     'experiment': ('spring_stabilised_inner', 'what to carry out', experiment_names()),

@@ -12,18 +12,44 @@ import pytest
 
 SRC = Path(__file__).resolve().parents[2]
 
-# docs/architecture.md. cg_sysid reaches cg_estimation only to replay it.
+# docs/architecture.md.
 MAY_IMPORT = {
     'cg_description': set(),
     'cg_dynamics': {'cg_description'},
-    'cg_estimation': {'cg_description', 'cg_dynamics'},
-    'cg_control': {'cg_description', 'cg_dynamics'},
-    'cg_hardware': {'cg_description', 'cg_dynamics'},
-    'cg_sysid': {'cg_description', 'cg_dynamics', 'cg_estimation'},
+    'cg_interfaces': {'cg_description', 'cg_dynamics'},
+    'cg_estimation': {'cg_description', 'cg_dynamics', 'cg_interfaces'},
+    'cg_control': {'cg_description', 'cg_dynamics', 'cg_interfaces'},
+    'cg_hardware': {'cg_description', 'cg_dynamics', 'cg_interfaces'},
+    'cg_sysid': {'cg_description', 'cg_dynamics', 'cg_interfaces'},
     'cg_bringup': {
-        'cg_control', 'cg_description', 'cg_dynamics', 'cg_estimation', 'cg_hardware', 'cg_sysid',
+        'cg_control', 'cg_description', 'cg_dynamics', 'cg_estimation', 'cg_hardware',
+        'cg_interfaces', 'cg_sysid',
     },
 }  # fmt: skip
+# Rooms of a package, by floor: a module imports from its own room and from floors below. Modules
+# beside the rooms are on the ground floor, if they are not named.
+FLOORS = {
+    'cg_sysid': (
+        ('records',),
+        ('experiments', 'identification'),
+        ('stances',),
+        ('checks', 'search'),
+        ('learned', 'landings'),
+        ('diagnosis',),
+        ('report',),
+        ('cli',),
+    ),
+    'cg_dynamics': (
+        ('mechanisms',),
+        ('effects',),
+        ('model',),
+        ('assemble',),
+        ('rollout',),
+        ('walking',),
+        ('plant', 'linearise', 'cluster'),
+    ),
+}
+GROUND = {'cg_sysid': {'__init__', '__main__'}}  # these reach up: they are the way in
 ROS = {
     'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
     'std_msgs', 'std_srvs', 'trajectory_msgs', 'visualization_msgs',
@@ -51,6 +77,32 @@ def test_imports_point_one_way(package):
     for path in modules(package):
         foreign = {name for name in imports(path) if name.startswith('cg_')} - allowed
         assert not foreign, f'{path.relative_to(SRC)} imports {foreign}'
+
+
+def own_imports(path, package):
+    """Modules of its own package that a file imports, as tuples of names below it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            first, *below = node.module.split('.')
+            if first == package:
+                yield tuple(below)
+
+
+@pytest.mark.parametrize('package', FLOORS)
+def test_rooms_import_from_floors_below(package):
+    floor_of = {room: i for i, rooms in enumerate(FLOORS[package], 1) for room in rooms}
+    folders = {p.parent.name for p in (SRC / package / package).glob('*/__init__.py')}
+    assert folders <= set(floor_of)
+    for path in modules(package):
+        room = path.relative_to(SRC / package / package).parts[0].removesuffix('.py')
+        if room in GROUND.get(package, ()):
+            continue
+        for below in own_imports(path, package):
+            other = below[0] if below and below[0] in floor_of else ''
+            if other == room:
+                continue
+            here, there = floor_of.get(room, 0), floor_of.get(other, 0)
+            assert there < here or there == 0, f'{path.relative_to(SRC)} imports {other}'
 
 
 @pytest.mark.parametrize('package', MAY_IMPORT)
@@ -108,7 +160,7 @@ def test_executables_point_to_functions(entry):
     'module',
     [
         'cg_control.tvlqr_node', 'cg_estimation.observer_node', 'cg_hardware.simulation_node',
-        'cg_sysid.diagnose', 'cg_sysid.recorder_node',
+        'cg_sysid.diagnosis.diagnose', 'cg_sysid.records.recorder_node',
     ],
 )  # fmt: skip
 def test_parts_of_scipy_are_loaded_when_they_are_used(module):

@@ -19,9 +19,9 @@ from sensor_msgs.msg import JointState  # noqa: E402
 
 from cg_bringup.balance_run import BalanceOptions, balance_nodes  # noqa: E402
 from cg_bringup.supervisor import supervised  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import to_nanoseconds  # noqa: E402
-from cg_sysid.experiments import load_experiment  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import to_nanoseconds  # noqa: E402
+from cg_sysid.experiments.catalogue import load_experiment  # noqa: E402
 
 PATIENCE = 60.0  # s for start-up on a busy machine
 ENOUGH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)

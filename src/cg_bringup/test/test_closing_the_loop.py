@@ -17,11 +17,11 @@ from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_estimation.estimator import replay
 from cg_estimation.high_gain import HighGainObserver
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 
 # One process makes the models for all of these tests.
 pytestmark = pytest.mark.xdist_group('closing_the_loop')

@@ -11,8 +11,8 @@ pytest.importorskip('rclpy')
 
 from cg_bringup.experiment import main, run_experiment
 from cg_bringup.runs import Run
-from cg_dynamics.domains import own_domain
-from cg_sysid.experiments import ExperimentError, load_experiment
+from cg_interfaces.domains import own_domain
+from cg_sysid.experiments.catalogue import ExperimentError, load_experiment
 
 SENSORS = ('/imu', '/hip_encoder', '/foot_contact/inner', '/foot_contact/outer')
 

@@ -5,7 +5,7 @@ import pytest
 from cg_bringup.hidden import hide, hideable_effects
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.experiments import ExperimentError
+from cg_sysid.experiments.catalogue import ExperimentError
 
 NOMINAL = Model.load(model_path('compass_gait_mit'))
 

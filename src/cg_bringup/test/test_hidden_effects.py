@@ -15,14 +15,14 @@ from cg_bringup.hidden import hide, perturb
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.bag_writer import write_bag
-from cg_sysid.bags import read_bag
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnose_cli import main
-from cg_sysid.diagnosis import Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.rehearse import rehearse
+from cg_sysid.cli.diagnose import main
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.records.bag_writer import write_bag
+from cg_sysid.records.bags import read_bag
 
 PROGRAMME = (
     'spring_stabilised_inner',

@@ -12,7 +12,7 @@ pytest.importorskip('launch_ros.actions', reason='launch is not among the ROS wh
 
 from launch.actions import DeclareLaunchArgument
 
-from cg_dynamics.domains import own_domain
+from cg_interfaces.domains import own_domain
 
 pytestmark = pytest.mark.alone
 

@@ -20,10 +20,11 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_estimation.high_gain import HighGainObserver
-from cg_sysid.bags import write_bag
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options, effect_name
-from cg_sysid.intake import take_in
+from cg_sysid.checks.loading import take_in
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.records.bags import write_bag
+from cg_sysid.search.ranking import effect_name
 
 MODEL_FILE = model_path('compass_gait_mit')
 T = 0.002

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cg_dynamics.domains import own_domain
 from cg_dynamics.model import Model
+from cg_interfaces.domains import own_domain
 
 pytest.importorskip('rclpy')
 

@@ -15,9 +15,9 @@ from cg_bringup.rebalance_run import RebalanceOptions, rebalance_nodes  # noqa: 
 from cg_control.trajectory_server_node import TrajectoryServerNode  # noqa: E402
 from cg_control.tvlqr_node import TvlqrNode  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_estimation.observer_node import ObserverNode  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
 
 NODES = {
     'observer': ObserverNode,

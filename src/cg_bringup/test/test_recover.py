@@ -24,13 +24,13 @@ from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
 from cg_control.tree_files import tree_path  # noqa: E402
 from cg_control.tree_server_node import TreeServerNode  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
 from cg_dynamics.model import Model  # noqa: E402
 from cg_dynamics.plant import Plant  # noqa: E402
 from cg_dynamics.rig import STANCES, Setup  # noqa: E402
 from cg_estimation.high_gain import HighGainObserver  # noqa: E402
 from cg_estimation.observer_node import ObserverNode  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
 
 NODES = {
     'observer': ObserverNode,

@@ -12,8 +12,8 @@ from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_estimation.high_gain import HighGainObserver
 from cg_estimation.observer_settings import ObserverSettings
-from cg_sysid.bags import read_bag, write_bag
-from cg_sysid.record import Record
+from cg_sysid.records.bags import read_bag, write_bag
+from cg_sysid.records.record import Record
 
 MODEL = Model.load(model_path('compass_gait_mit'))
 SETUP = Setup(stance='outer')

@@ -17,8 +17,8 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from cg_bringup import balance_run, rebalance_run, recover_run  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import MACHINE_QOS  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import MACHINE_QOS  # noqa: E402
 
 PATIENCE = 60.0  # s for start-up on a busy machine
 PROMISED = 2.0  # s in which nothing is left of a runner that was killed

@@ -8,13 +8,13 @@ from cg_bringup.runs import Run, experiment_nodes, parameter_file_text
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import (
+from cg_sysid.experiments.catalogue import (
     ExperimentError,
     experiment_names,
     load_experiment,
     parse_experiment,
 )
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 
 EXPECTED = {
     'spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cg_sysid.command import COMMANDS
+from cg_sysid.cli.command import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -24,7 +24,7 @@ from cg_control.linearise import discretise, linearise_stance
 from cg_control.lqr import LqrError, dlqr
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.settings import setting
+from cg_interfaces.settings import setting
 
 NANOSECONDS = 1_000_000_000
 IDLE, BALANCING, FALLEN = 'idle', 'balancing', 'fallen'

@@ -18,7 +18,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -29,8 +29,16 @@ from cg_control.live_design import LiveDesign
 from cg_control.state_message import state_of
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
-from cg_dynamics.settings import setting
+from cg_interfaces import topics
+from cg_interfaces.ros import (
+    SENSOR_QOS,
+    DeclaredSettings,
+    publish_status,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
+from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 GAP = 0.02  # s between states after which the one before is history
@@ -85,10 +93,10 @@ class BalanceNode(Node):
         self._reason = 'no state yet'
         self._ages = AnswerAges()
         self._next_diagnosis = 0.0
-        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
-        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
-        self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
+        self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self.create_subscription(JointState, topics.STATE, self.on_state, SENSOR_QOS)
+        self.create_subscription(JointState, topics.APPLIED_TORQUE, self.on_applied, SENSOR_QOS)
         self.started = True
 
     def _judge(self, parameters: list) -> SetParametersResult:
@@ -154,10 +162,7 @@ class BalanceNode(Node):
         status.message = self.controller.mode + (f': {self._reason}' if self._reason else '')
         values = {'falls': self.controller.falls}
         values |= self._ages.figures(self.declared.values.deadline)
-        status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = to_stamp(time.time_ns())
-        self.diagnostics.publish(array)
+        publish_status(self.diagnostics, status, values)
 
     def close(self) -> None:
         """Leave with zero torque, and no process behind."""

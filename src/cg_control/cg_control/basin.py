@@ -29,11 +29,11 @@ from cg_control.linearise import linearise_stance
 from cg_description.reading import parse_yaml, read_text
 from cg_description.schema import Key, ListOf, Mapping, Number, Text
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import Feedback, simulate_batch
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.batch import Feedback, simulate_batch
+from cg_dynamics.rollout.compiled import compile_model
 
 SWINGS = (0.0, 0.1, 0.2, 0.3)  # rad
 SAMPLES = 24  # states tried at each swing amplitude and capture coordinate

@@ -23,9 +23,9 @@ from cg_control.collocation import PlanningError
 from cg_control.flow import phase_flow, state_rates
 from cg_control.trajectory import Phase, Trajectory
 from cg_control.tvlqr import impact_derivative
-from cg_dynamics.hybrid import STANCES
-from cg_dynamics.impact import impact
 from cg_dynamics.model import Model
+from cg_dynamics.walking.hybrid import STANCES
+from cg_dynamics.walking.impact import impact
 
 CORRECTION = (0.1, 0.1, 0.3, 0.3, 3.0)  # rad, rad/s and N m that are worth the same
 DURATION = 0.1  # s that is worth as much

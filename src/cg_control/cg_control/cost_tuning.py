@@ -28,9 +28,9 @@ from cg_control.trajectory import Trajectory
 from cg_control.tvlqr import Weights, stabilise
 from cg_description.model_file import write_atomically
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.hybrid import WalkOptions
 
 TUNED = ('stance_angle', 'swing_angle', 'stance_rate', 'swing_rate', 'torque', 'final')
 FIRST_FACTOR, LAST_FACTOR = 10.0, 2.0  # of a random change, standard deviation in the logarithm

@@ -16,7 +16,7 @@ from cg_control.tracking import Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import Trajectory
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.settings import setting
+from cg_interfaces.settings import setting
 
 TRACKING, CAUGHT = 'tracking', 'caught'
 

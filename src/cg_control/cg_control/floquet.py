@@ -7,7 +7,7 @@ A deviation follows (FLOW) from knot to knot and jumps at impacts by
 if the clock of torque and gains starts anew at each impact, whenever that is: so deviations are
 compared at the impacts themselves. With f+ n' / (n'f-) besides, (SALT), they are compared at one
 instant. After an impact both feet are on the ground, which leaves the three coordinates of a
-section, (alpha, v_st, v_sw) of cg_dynamics.gait, and three multipliers.
+section, (alpha, v_st, v_sw) of cg_dynamics.walking.gait, and three multipliers.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 from cg_control.flow import phase_flow
 from cg_control.orbit import Orbit
 from cg_control.tvlqr import jump_matrix
-from cg_dynamics.gait import section_coordinates, section_state
+from cg_dynamics.walking.gait import section_coordinates, section_state
 
 
 def monodromy(orbit: Orbit, feedback: bool = False, restarts: bool = True) -> np.ndarray:

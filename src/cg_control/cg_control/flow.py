@@ -19,9 +19,9 @@ import numpy as np
 
 from cg_control.trajectory import Phase
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
 
 SUBSTEPS = np.arange(2, 17, 2)
 

@@ -17,7 +17,7 @@ from cg_dynamics.effects import Effect
 from cg_dynamics.linearise import without_extra_states
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces.settings import Settings, setting
 
 
 @dataclass(frozen=True)

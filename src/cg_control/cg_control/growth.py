@@ -29,9 +29,9 @@ from cg_control.rollouts import Outcome, Rollouts, follow
 from cg_control.tracking import TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tree import Tree
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
-from cg_dynamics.vector_code import WIDTH
+from cg_dynamics.rollout.vector_code import WIDTH
+from cg_dynamics.walking.hybrid import WalkOptions
 
 MOST_CLAIMS = 12  # of one state, after which it counts as unclaimed
 MOST_LANDINGS = 6  # of a robot whose foot lands where no impact is planned

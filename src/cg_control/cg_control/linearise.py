@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.linearise import (
     Linearisation,
     linearise,
@@ -23,6 +22,7 @@ from cg_dynamics.linearise import (
 )
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 # They change what is commanded, read or met on the way, not how the bodies move.
 NOT_DESIGNED_ON = ('command', 'sensor', 'timing')

@@ -25,9 +25,9 @@ import numpy as np
 from cg_control.collocation import planning_model
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 STILL = 1e-3  # at rest every point is equally close: this much of trace(F) counts against that
 LATE = 0.3  # s for which the reference goes on while an impact is late

@@ -19,12 +19,12 @@ from cg_control.friction import friction_parameters, friction_torque
 from cg_control.program import Guess
 from cg_control.task import Box, Task
 from cg_control.trajectory import Phase, Trajectory
-from cg_dynamics.contact import Ground
-from cg_dynamics.hybrid import swing_foot
-from cg_dynamics.impact import Impact, impact
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.unpinned import ground_reaction
+from cg_dynamics.walking.contact import Ground
+from cg_dynamics.walking.hybrid import swing_foot
+from cg_dynamics.walking.impact import Impact, impact
+from cg_dynamics.walking.unpinned import ground_reaction
 
 PASSED = 0.02  # m the swing foot must be ahead for an impact: WalkOptions.minimum_step
 SAMPLES = 20  # of an interval, where a motion is measured

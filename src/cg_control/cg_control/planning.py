@@ -1,8 +1,9 @@
 """From a task to a trajectory that may be run: planned, given feedback, and checked.
 
-The check simulates the exact hybrid model (cg_dynamics.hybrid): open loop, the model as it was
-planned on, for as long as collocation can be held to its word, since the upright robot amplifies
-every error by exp(3.2 t); closed loop, the robot with everything that it has, over all of it.
+The check simulates the exact hybrid model (cg_dynamics.walking.hybrid): open loop, the model as it
+was planned on, for as long as collocation can be held to its word, since the upright robot
+amplifies every error by exp(3.2 t); closed loop, the robot with everything that it has, over all
+of it.
 """
 
 from dataclasses import dataclass
@@ -15,8 +16,8 @@ from cg_control.task import Task
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.trajectory import Trajectory
 from cg_control.tvlqr import Weights, stabilise
-from cg_dynamics.hybrid import Walk, WalkOptions, walk
 from cg_dynamics.model import Model
+from cg_dynamics.walking.hybrid import Walk, WalkOptions, walk
 
 SAMPLE_TIME = 0.002  # s
 

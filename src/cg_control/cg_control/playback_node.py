@@ -16,8 +16,9 @@ from sensor_msgs.msg import Imu, JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from cg_dynamics.rig import STANCES
-from cg_dynamics.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces import topics
+from cg_interfaces.ros import SENSOR_QOS, DeclaredSettings, run, to_nanoseconds, to_stamp
+from cg_interfaces.settings import Settings, setting
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,9 @@ class PlaybackNode(Node):
         self.last_ns: int | None = None
         self.message = JointState(name=['hip'])
         self.message.header.frame_id = 'hip'
-        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+        self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.create_subscription(JointTrajectory, '/trajectory', self.on_order, SENSOR_QOS)
-        self.create_subscription(Imu, '/imu', self.on_measurement, SENSOR_QOS)
+        self.create_subscription(Imu, topics.IMU, self.on_measurement, SENSOR_QOS)
 
     def on_order(self, message: JointTrajectory) -> None:
         """Start or stop."""

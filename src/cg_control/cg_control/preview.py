@@ -24,10 +24,10 @@ from cg_control.rollouts import Outcome, follow
 from cg_control.routes import Routes
 from cg_control.tracking import TrackingSettings
 from cg_control.tree import Tree
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.vector_code import WIDTH
+from cg_dynamics.rollout.vector_code import WIDTH
+from cg_dynamics.walking.hybrid import WalkOptions
 
 NEAREST = 4
 CHAMPIONS = 60  # of each leg

@@ -8,7 +8,7 @@ from the other modes. While |u| <= U, it can be brought back only from
 and a robot that falls backward, zeta < -1, is lost for good: a step is taken ahead only. Within
 these bounds the swing leg pays: the torque that catches the robot drives it away. And a robot that
 falls forward has to get its foot ahead first. Both is seen by driving the nonlinear stance phase
-with a hundred torques at the limit, switched at most twice, all at once (cg_dynamics.batch):
+with a hundred torques at the limit, switched at most twice, all at once (rollout/batch.py):
 
     no step      some torque makes |zeta| small while the swing leg's amplitude is below 1.2 rad
     one step     the same, or a landing after which |zeta| is small on the other leg
@@ -30,10 +30,10 @@ from cg_control.collocation import Options
 from cg_control.linearise import linearise_stance
 from cg_control.program import GUESSES
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import simulate_batch
-from cg_dynamics.impact import impact_function, other
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.batch import simulate_batch
+from cg_dynamics.walking.impact import impact_function, other
 
 STEP, DURATION = 0.025, 0.8  # s, of the torques that are tried
 SWITCHES = (0.025, 0.075, 0.125, 0.175, 0.225, 0.3, 0.4, 0.5)  # s, of the first

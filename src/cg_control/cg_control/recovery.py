@@ -46,8 +46,8 @@ from cg_control.tracking import Tracker, TrackingSettings
 from cg_control.tree import Tree
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.settings import setting
-from cg_dynamics.vector_code import WIDTH
+from cg_dynamics.rollout.vector_code import WIDTH
+from cg_interfaces.settings import setting
 
 FOLLOWING, OUTSIDE = 'following', 'outside'
 KEPT = 5000  # look-ups whose time is remembered

@@ -23,17 +23,23 @@ from cg_control.friction import friction_parameters, friction_torque
 from cg_control.nodes import Nodes, Way, triangles
 from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
-from cg_dynamics.c_compiler import compiler, shared_library
-from cg_dynamics.compiled import CompiledModel, compile_model
-from cg_dynamics.contact import contact_law
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import Walker, WalkOptions
-from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.vector_code import FLAGS, WIDTH, UnsupportedError, vector_code, vector_math
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
+from cg_dynamics.rollout.compiler import compiler, shared_library
+from cg_dynamics.rollout.vector_code import (
+    FLAGS,
+    WIDTH,
+    UnsupportedError,
+    vector_code,
+    vector_math,
+)
+from cg_dynamics.walking.contact import contact_law
+from cg_dynamics.walking.hybrid import Walker, WalkOptions
+from cg_dynamics.walking.impact import impact_function
 
 log = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from cg_control.trajectory import Phase, Trajectory
 from cg_control.tree import Tree
 from cg_control.tvlqr import riccati
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.linearise import linearise
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 STANCE = STANCES[0]  # what has no feet stands on the first leg of every tree
 REACH = 40.0  # rad and rad/s: bounds of every state

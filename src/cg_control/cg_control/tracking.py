@@ -24,7 +24,7 @@ from cg_control.nodes import LATE, Nodes
 from cg_control.trajectory import Trajectory
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces.settings import Settings, setting
 
 REMEDIES = ('clock', 'blank', 'event', 'phase')
 LEAST_TURN = 0.2  # of 1 - n_s'(x - x0), which is 0 where surfaces meet: there no phase is defined

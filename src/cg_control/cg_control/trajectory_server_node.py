@@ -25,8 +25,8 @@ from cg_control.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run
+from cg_interfaces.settings import Settings, setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 PLANNED = {'inner_to_outer': ('inner', 'outer'), 'outer_to_inner': ('outer', 'inner')}

@@ -34,12 +34,12 @@ import numpy as np
 
 from cg_control.friction import friction_torque
 from cg_dynamics.assemble import acting_effects, assemble, parameter_names
-from cg_dynamics.c_compiler import FLAGS, compiler, object_file, shared_library
-from cg_dynamics.hybrid import other
-from cg_dynamics.impact import impact_function
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiler import FLAGS, compiler, object_file, shared_library
+from cg_dynamics.walking.hybrid import other
+from cg_dynamics.walking.impact import impact_function
 
 log = logging.getLogger(__name__)
 

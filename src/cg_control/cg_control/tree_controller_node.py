@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
@@ -35,15 +35,17 @@ from cg_control.tree_files import TreeSelection
 from cg_control.tree_loader import TreeLoader
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_dynamics.ros import (
+from cg_interfaces import topics
+from cg_interfaces.ros import (
     LATCHED_QOS,
     SENSOR_QOS,
     DeclaredSettings,
+    publish_status,
     run,
     to_nanoseconds,
     to_stamp,
 )
-from cg_dynamics.settings import setting
+from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 GAP = 0.02  # s between states after which the one before is history
@@ -112,13 +114,13 @@ class TreeControllerNode(Node):
         self._slow = 0
         self.message = JointState(name=['hip'])
         self.message.header.frame_id = 'hip'
-        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+        self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.node_publisher = self.create_publisher(Int32, '/tree/node', SENSOR_QOS)
         self.reference_publisher = self.create_publisher(Int32, '/tree/reference', SENSOR_QOS)
         self._referred_ns = 0
-        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
-        self.create_subscription(JointState, '/applied_torque', self.on_applied, SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self.create_subscription(JointState, topics.STATE, self.on_state, SENSOR_QOS)
+        self.create_subscription(JointState, topics.APPLIED_TORQUE, self.on_applied, SENSOR_QOS)
         self.create_subscription(String, '/tree/selected', self.on_selected, LATCHED_QOS)
         self.create_subscription(Twist, '/cmd_vel', self.on_speed, 10)
         self.add_on_set_parameters_callback(self._judge)
@@ -270,10 +272,7 @@ class TreeControllerNode(Node):
                 values |= percentiles(name, 'us', 1e6 * np.array(times), 1)
         values |= self._ages.figures(self.declared.values.deadline)
         self._slow = 0
-        status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = to_stamp(time.time_ns())
-        self.diagnostics.publish(array)
+        publish_status(self.diagnostics, status, values)
 
     def close(self) -> None:
         """Leave with zero torque, and no process behind."""

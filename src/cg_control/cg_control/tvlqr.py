@@ -29,12 +29,12 @@ from cg_control.linearise import linearise_stance
 from cg_control.lqr import Regulator, lqr
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
-from cg_dynamics.hybrid import STANCES
-from cg_dynamics.impact import impact_function
 from cg_dynamics.linearise import without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
+from cg_dynamics.walking.hybrid import STANCES
+from cg_dynamics.walking.impact import impact_function
 
 SWEEPS, SETTLED = 200, 1e-9  # periods until a cost to go repeats itself, and to what share
 GAUSS = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6

@@ -16,7 +16,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -30,15 +30,17 @@ from cg_control.state_message import state_of
 from cg_control.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_dynamics.ros import (
+from cg_interfaces import topics
+from cg_interfaces.ros import (
     LATCHED_QOS,
     SENSOR_QOS,
     DeclaredSettings,
+    publish_status,
     run,
     to_nanoseconds,
     to_stamp,
 )
-from cg_dynamics.settings import setting
+from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 GAP = 0.02  # s between states after which the one before is history
@@ -92,9 +94,9 @@ class TvlqrNode(Node):
         self._started_unasked = False
         self.message = JointState(name=['hip'])
         self.message.header.frame_id = 'hip'
-        self.publisher = self.create_publisher(JointState, '/torque_command', SENSOR_QOS)
-        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_subscription(JointState, '/state', self.on_state, SENSOR_QOS)
+        self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        self.create_subscription(JointState, topics.STATE, self.on_state, SENSOR_QOS)
         self.create_subscription(
             String, '/trajectory/selected', self.on_selected, LATCHED_QOS
         )
@@ -194,10 +196,7 @@ class TvlqrNode(Node):
                 'trajectory': json.dumps(self.trajectory.modes if self.trajectory else []),
                 'problem': self.problem,
             }
-            status.values = [KeyValue(key=k, value=str(v)) for k, v in values.items()]
-            array = DiagnosticArray(status=[status])
-            array.header.stamp = to_stamp(time.time_ns())
-            self.diagnostics.publish(array)
+            publish_status(self.diagnostics, status, values)
         return 0.2
 
     def close(self) -> None:

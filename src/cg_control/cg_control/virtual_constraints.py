@@ -19,9 +19,9 @@ from cg_control.collocation import planning_model
 from cg_control.friction import friction_parameters, friction_torque
 from cg_control.trajectory import Phase, Trajectory, TrajectoryError
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
 
 BANDWIDTH = 20.0  # 1/s
 LEAST_GRIP = 0.05  # of what 1 N m does to d2y/dt2 on the orbit: below this the torque is nothing

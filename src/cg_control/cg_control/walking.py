@@ -29,9 +29,9 @@ from cg_control.trajectory import TrajectoryError
 from cg_control.transverse import stabilise_over_phase
 from cg_control.tree import Tree
 from cg_control.tvlqr import Weights
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.hybrid import WalkOptions
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 from cg_control.surfaces import between
 from cg_control.trajectory import Phase
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 TIGHT = {'method': 'DOP853', 'rtol': 1e-12, 'atol': 1e-13}
 

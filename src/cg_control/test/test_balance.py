@@ -21,9 +21,9 @@ from cg_control.linearise import design_model, linearise_stance
 from cg_control.lqr import LqrError
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 MODEL = Model.load(model_path('compass_gait_mit'))
 FLEXIBLE = Model.load(model_path('compass_gait_flexible'))

@@ -15,8 +15,8 @@ from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from cg_control.balance_node import BalanceNode  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
 pytestmark = pytest.mark.alone
 

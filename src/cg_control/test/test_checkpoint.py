@@ -19,8 +19,8 @@ from cg_control.tracking import TrackingSettings
 from cg_control.tree import Tree, TreeError
 from cg_control.tvlqr import Weights
 from cg_description.paths import model_path
-from cg_dynamics.c_compiler import compiler
 from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiler import compiler
 
 pytestmark = [
     pytest.mark.skipif(compiler() is None, reason='thousands of rollouts'),

@@ -10,8 +10,8 @@ from small_growth import ROUND, assert_same, make_small
 from cg_control import grow_tree
 from cg_control.cluster import Cluster
 from cg_dynamics import cluster
-from cg_dynamics.c_compiler import compiler
 from cg_dynamics.cluster import ClusterError
+from cg_dynamics.rollout.compiler import compiler
 from cg_dynamics.watched_processes import WorkLost
 
 pytest.importorskip('distributed', reason='the cluster part is not installed')

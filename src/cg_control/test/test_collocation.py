@@ -20,9 +20,9 @@ from cg_control.friction import FrictionCompensation
 from cg_control.nodes import Nodes
 from cg_control.task import Box, Ellipsoid, Stretch, Task
 from cg_control.tvlqr import stabilise
-from cg_dynamics.gait import find_gait
-from cg_dynamics.hybrid import WalkOptions, walk
-from cg_dynamics.impact import impact
+from cg_dynamics.walking.gait import find_gait
+from cg_dynamics.walking.hybrid import WalkOptions, walk
+from cg_dynamics.walking.impact import impact
 
 REBALANCE = Task(('inner', 'outer'), reach=0.2)
 

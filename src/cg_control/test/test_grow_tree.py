@@ -24,7 +24,7 @@ from cg_control.lookup import Lookup
 from cg_control.rollouts import Outcome, follow
 from cg_control.tracking import TrackingSettings
 from cg_control.tree import Tree
-from cg_dynamics.c_compiler import compiler
+from cg_dynamics.rollout.compiler import compiler
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
 

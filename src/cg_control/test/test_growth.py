@@ -12,9 +12,9 @@ from cg_control.nodes import ARRAYS, Nodes
 from cg_control.rollouts import Outcome
 from cg_control.tree import Tree
 from cg_control.tvlqr import Weights, balance_regulator
-from cg_dynamics.c_compiler import compiler
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.rig import STANCES
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.walking.hybrid import WalkOptions
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
 

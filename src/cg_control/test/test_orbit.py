@@ -17,11 +17,11 @@ from cg_control.orbit_library import orbit_library
 from cg_control.trajectory import Phase, Trajectory
 from cg_control.tvlqr import stabilise
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.gait import find_gait, section_coordinates, section_state
-from cg_dynamics.hybrid import WalkOptions, walk
-from cg_dynamics.impact import impact
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.gait import find_gait, section_coordinates, section_state
+from cg_dynamics.walking.hybrid import WalkOptions, walk
+from cg_dynamics.walking.impact import impact
 
 LENGTH, SPEED, SLOPE = 0.32, 0.35, -0.01
 EXACT = {'method': 'DOP853', 'rtol': 1e-13, 'atol': 1e-14}

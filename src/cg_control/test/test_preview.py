@@ -9,8 +9,8 @@ from cg_control.growth import Grower, GrowthOptions, Region
 from cg_control.lookup import Lookup
 from cg_control.preview import LANDING, Preview
 from cg_control.rollouts import Outcome, follow
-from cg_dynamics.c_compiler import compiler
-from cg_dynamics.hybrid import WalkOptions
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.walking.hybrid import WalkOptions
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
 

@@ -7,8 +7,8 @@ from cg_control.collocation import Options, PlanningError, optimise, planning_mo
 from cg_control.linearise import linearise_stance
 from cg_control.reach import HELD, Screen, cheap
 from cg_control.task import Box, Task
-from cg_dynamics.impact import other
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.impact import other
 
 
 @pytest.fixture(scope='module')

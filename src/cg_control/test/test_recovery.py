@@ -17,11 +17,11 @@ from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings,
 from cg_control.tracking import Tracker
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_dynamics.c_compiler import compiler
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import Walker
 from cg_dynamics.rig import STANCES
-from cg_dynamics.vector_code import WIDTH
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.rollout.vector_code import WIDTH
+from cg_dynamics.walking.hybrid import Walker
 
 COMPILED = pytest.mark.skipif(compiler() is None, reason='hundreds of rollouts')
 SAMPLE_NS = 2_000_000

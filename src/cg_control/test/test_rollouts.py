@@ -11,12 +11,12 @@ from cg_control.rollouts import Outcome, follow
 from cg_control.tracking import Tracker, TrackingSettings
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import Feedback, simulate_batch
-from cg_dynamics.c_compiler import compiler
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.batch import Feedback, simulate_batch
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 OPTIONS = WalkOptions(sample_time=0.002, step=0.002)
 SPREAD = np.array([0.03, 0.06, 0.06, 0.1])

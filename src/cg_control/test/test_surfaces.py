@@ -19,7 +19,7 @@ from cg_control.surfaces import (
 )
 from cg_control.task import Box, Task
 from cg_control.trajectory import Phase, TrajectoryError
-from cg_dynamics.hybrid import swing_foot
+from cg_dynamics.walking.hybrid import swing_foot
 
 SLOPE = np.radians(-1.0)
 

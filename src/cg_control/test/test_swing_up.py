@@ -11,9 +11,9 @@ from cg_control.preview import AT_HOME
 from cg_control.rollouts import Outcome, follow
 from cg_control.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
 from cg_description.paths import model_path
-from cg_dynamics.c_compiler import compiler
-from cg_dynamics.hybrid import WalkOptions
 from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.walking.hybrid import WalkOptions
 
 PENDULUM = Model.load(model_path('tedrake_pendulum'))
 SWING = SwingOptions(Q=np.diag([10.0, 1.0]), R=15.0, intervals=20)

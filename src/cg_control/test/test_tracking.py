@@ -13,7 +13,7 @@ from cg_control.planning import CheckOptions, RejectedError, check, executed, pl
 from cg_control.task import Task
 from cg_control.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
 from cg_control.trajectory import TrajectoryError
-from cg_dynamics.hybrid import WalkOptions
+from cg_dynamics.walking.hybrid import WalkOptions
 
 OPTIONS = WalkOptions(sample_time=0.004, step=0.002, minimum_step=0.1, fall_angle=0.6)
 TASK = Task(('inner', 'outer'), reach=0.2)

@@ -24,8 +24,8 @@ from cg_control.trajectory_server_node import (  # noqa: E402
     joint_trajectory,
 )
 from cg_control.tvlqr_node import TvlqrNode  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
 
 PATIENCE = 60.0  # s; discovery on a busy machine
 

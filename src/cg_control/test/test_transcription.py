@@ -6,9 +6,9 @@ import pytest
 from cg_control.collocation import planning_model
 from cg_control.transcription import EDGE, PIECES, UNITS, Structure, transcribe
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.impact import impact
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.impact import impact
 
 TASK = [0.03, 0.02, 0.1, 0.05, 0.1, 0.05, 0.4]
 CASES = [

@@ -41,8 +41,8 @@ from cg_control.tvlqr import (
     stabilise,
     stabilise_periodically,
 )
-from cg_dynamics.hybrid import WalkOptions, walk
-from cg_dynamics.impact import impact
+from cg_dynamics.walking.hybrid import WalkOptions, walk
+from cg_dynamics.walking.impact import impact
 
 SLOPE = np.radians(-1.0)
 

@@ -27,8 +27,8 @@ from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
 from cg_control.tree_files import TreeSelection, tree_path  # noqa: E402
 from cg_control.tree_server_node import TreeServerNode  # noqa: E402
 from cg_control.way_home import WayHome  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
 
 pytestmark = pytest.mark.alone
 

@@ -11,8 +11,8 @@ from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_control.tube_view import CORNERS, MOST, POSES, surface_segments, tube_segments
 from cg_control.way_home import WayHome
-from cg_dynamics.hybrid import swing_foot
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.hybrid import swing_foot
 
 LENGTH = 1.1  # m
 

@@ -26,9 +26,9 @@ from cg_control.tvlqr import (
     stabilise_periodically,
 )
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 
 @pytest.fixture(scope='module')

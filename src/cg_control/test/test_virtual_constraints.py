@@ -11,9 +11,9 @@ from cg_control.flow import state_rates
 from cg_control.orbit import plan_orbit
 from cg_control.trajectory import TrajectoryError
 from cg_control.virtual_constraints import BANDWIDTH, VirtualConstraints
-from cg_dynamics.hybrid import WalkOptions, walk
-from cg_dynamics.impact import impact
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.hybrid import WalkOptions, walk
+from cg_dynamics.walking.impact import impact
 
 
 @pytest.fixture(scope='module')

@@ -26,8 +26,8 @@ from cg_control.walking import (
     with_ways,
 )
 from cg_control.way_home import WayHome
-from cg_dynamics.hybrid import swing_foot, walk
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.hybrid import swing_foot, walk
 
 
 @pytest.fixture(scope='module')

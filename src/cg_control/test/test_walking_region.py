@@ -16,7 +16,7 @@ from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_control.walking import buried
 from cg_control.walking_region import OrbitPoints, WalkingRegion
-from cg_dynamics.c_compiler import compiler
+from cg_dynamics.rollout.compiler import compiler
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
 AROUND = np.array(grow_tree.AROUND)

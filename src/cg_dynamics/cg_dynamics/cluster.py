@@ -27,7 +27,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
-from cg_dynamics.c_compiler import compiler
+from cg_dynamics.rollout.compiler import compiler
 from cg_dynamics.watched_processes import WorkLost
 
 ADDRESS = re.compile(r'(tcp|tls)://(\[[0-9a-fA-F:.%\w]+\]|[^\[\]/:\s]+):\d{1,5}')

@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.effects import make_effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,14 @@ import numpy as np
 import scipy
 
 from cg_dynamics.assemble import parameter_vector, stamped
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.contact import contact_law
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.hybrid import INSTANT, Leg, Walker, WalkOptions, swing_foot
-from cg_dynamics.impact import impact, other
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.contact import contact_law
+from cg_dynamics.walking.hybrid import INSTANT, Leg, Walker, WalkOptions, swing_foot
+from cg_dynamics.walking.impact import impact, other
 
 FINE_STEP = 1e-4
 CONTACT_STEP = 5e-4  # where feet slide and fly, whose steps cost more and whose events are located

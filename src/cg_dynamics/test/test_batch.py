@@ -4,14 +4,14 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cg_dynamics import batch as module
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.batch import Feedback, batch_library, simulate_batch
-from cg_dynamics.c_compiler import compiler
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.rig import Setup
-from cg_dynamics.vector_code import UnsupportedError, vector_code
+from cg_dynamics.rollout import batch as module
+from cg_dynamics.rollout.batch import Feedback, batch_library, simulate_batch
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.rollout.compiler import compiler
+from cg_dynamics.rollout.vector_code import UnsupportedError, vector_code
 
 TIME = np.arange(0, 0.2, 0.002)
 FOURTH = -(-len(LIBRARY) // 4)

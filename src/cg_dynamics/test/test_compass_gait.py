@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.mechanisms import CompassGait
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 STATES = np.random.default_rng(seed=0).uniform(-1, 1, size=(20, 4)) * [0.8, 0.8, 3.0, 3.0]
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from cg_description.paths import model_path
-from cg_dynamics import c_compiler
-from cg_dynamics import compiled as module
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model, simulate
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout import compiled as module
+from cg_dynamics.rollout import compiler as c_compiler
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model, simulate
 
 TIME = np.arange(0, 0.4, 0.002)
 TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME) + 3 * np.cos(50 * TIME))[:, None]

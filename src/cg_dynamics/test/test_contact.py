@@ -9,13 +9,13 @@ import pytest
 from test_impact import PointBodies
 
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.contact import REST_SPEED, Ground, contact_impulse, contact_law, land
 from cg_dynamics.effects.effect import ContactLaw
-from cg_dynamics.gait import section_state
-from cg_dynamics.hybrid import WalkOptions, walk
-from cg_dynamics.impact import impact, other
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.unpinned import ground_reaction, unpinned
+from cg_dynamics.walking.contact import REST_SPEED, Ground, contact_impulse, contact_law, land
+from cg_dynamics.walking.gait import section_state
+from cg_dynamics.walking.hybrid import WalkOptions, walk
+from cg_dynamics.walking.impact import impact, other
+from cg_dynamics.walking.unpinned import ground_reaction, unpinned
 
 SLOPE = 0.05
 LAWS = [ContactLaw(e, mu) for e, mu in itertools.product((0.0, 0.3), (0.2, 0.5, 50.0, math.inf))]

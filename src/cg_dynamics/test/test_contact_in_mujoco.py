@@ -8,9 +8,9 @@ pytest.importorskip('mujoco', reason='MuJoCo is not installed')
 from mujoco_robot import two_links
 from mujoco_walker import MujocoWalker
 
-from cg_dynamics.gait import section_state
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.gait import section_state
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 SLOPE, SAMPLE, DURATION = 0.05, 0.002, 0.7
 

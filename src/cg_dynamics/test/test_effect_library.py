@@ -9,14 +9,14 @@ import pytest
 
 from cg_description.paths import model_path
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import ModelError
-from cg_dynamics.impact import impact
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup, Spring
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
+from cg_dynamics.walking.impact import impact
 
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.compiled import compile_model, simulate
-from cg_dynamics.contact import contact_law
 from cg_dynamics.effects import LIBRARY, UNMODELLED, make_effect
 from cg_dynamics.effects.unmodelled import LearnedEffect
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model, simulate
+from cg_dynamics.walking.contact import contact_law
 
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]

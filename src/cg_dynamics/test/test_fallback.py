@@ -5,13 +5,13 @@ import logging
 import numpy as np
 import pytest
 
-from cg_dynamics import c_compiler
-from cg_dynamics import compiled as module
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import CompiledModel, compile_model
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.fallback import InterpretedRollout
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout import compiled as module
+from cg_dynamics.rollout import compiler as c_compiler
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model
+from cg_dynamics.rollout.fallback import InterpretedRollout
 
 EFFECTS = [
     (),

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.gait import GaitError, find_gait, section_coordinates, section_state
-from cg_dynamics.hybrid import Walker, WalkOptions, swing_foot, walk
 from cg_dynamics.rig import STANCES
+from cg_dynamics.walking.gait import GaitError, find_gait, section_coordinates, section_state
+from cg_dynamics.walking.hybrid import Walker, WalkOptions, swing_foot, walk
 
 # The classic passive walker: two point-mass legs of 5 kg at half of 1 m, 10 kg at the hip.
 m, mh, a, b = 5.0, 10.0, 0.5, 0.5

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.errors import ModelError
-from cg_dynamics.impact import impact, impact_function, other
 from cg_dynamics.mechanisms import mechanism
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.unpinned import ground_reaction, unpinned
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.impact import impact, impact_function, other
+from cg_dynamics.walking.unpinned import ground_reaction, unpinned
 
 STATES = np.random.default_rng(seed=2).uniform(-1, 1, size=(8, 4)) * [0.5, 0.5, 2.0, 2.0]
 PAYLOAD = {'mass': 1.9, 'distance': 0.33}

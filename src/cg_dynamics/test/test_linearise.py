@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.linearise import linearise
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
 
 
 def test_upright_stance_has_the_known_eigenvalues(robot):

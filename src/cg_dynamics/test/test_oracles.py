@@ -9,8 +9,8 @@ import importlib
 import numpy as np
 import pytest
 
-from cg_dynamics.compiled import simulate
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import simulate
 
 TIME = np.arange(0, 1.0, 0.002)
 TORQUE = np.repeat(np.random.default_rng(3).normal(0, 3, 50), 10)

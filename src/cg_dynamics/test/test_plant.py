@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from cg_description.paths import model_path
-from cg_dynamics.hybrid import WalkOptions, walk
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
+from cg_dynamics.walking.hybrid import WalkOptions, walk
 
 MODEL = Model.load(model_path('compass_gait_mit'))
 X0 = np.array([0.1, -0.2, 0.3, 0.1])

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from cart_pole import FILE, CartPole, cart, install
 
-from cg_dynamics.compiled import simulate
 from cg_dynamics.effects import LIBRARY, UNMODELLED, make_effect
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.model import Model, ModelError
 from cg_dynamics.parameter import sliding_unit
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import simulate
 
 CART = CartPole()
 ALONG = [

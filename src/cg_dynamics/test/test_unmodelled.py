@@ -6,13 +6,13 @@ import pytest
 
 from cg_description.paths import model_path
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.batch import simulate_batch
-from cg_dynamics.compiled import CompiledModel, compile_model, simulate
 from cg_dynamics.effects import LIBRARY, UNMODELLED
 from cg_dynamics.effects.unmodelled import COSINES
 from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_dynamics.rollout.batch import simulate_batch
+from cg_dynamics.rollout.compiled import CompiledModel, compile_model, simulate
 
 COMPASS = MECHANISMS['compass_gait']
 EVERYWHERE = [(name, site) for name, cls in UNMODELLED.items() for site in cls.sites(COMPASS)]

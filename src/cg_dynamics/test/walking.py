@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from cg_dynamics.gait import section_state
-from cg_dynamics.hybrid import Walk, WalkOptions, walk
 from cg_dynamics.model import Model
+from cg_dynamics.walking.gait import section_state
+from cg_dynamics.walking.hybrid import Walk, WalkOptions, walk
 
 SLOPE = 0.05
 RATE = 500.0

@@ -25,10 +25,10 @@ from typing import Protocol
 import numpy as np
 
 from cg_dynamics.assemble import parameter_vector, stamped
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.impact import impact
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.impact import impact
 
 NANOSECONDS = 1_000_000_000
 RUNAWAY = 1e3  # rad, rad/s: no estimate of this robot is there

@@ -15,8 +15,6 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from cg_dynamics.compiled import CompiledModel
-from cg_dynamics.impact import impact_function
 from cg_dynamics.linearise import (
     jacobians,
     linearise,
@@ -25,6 +23,8 @@ from cg_dynamics.linearise import (
 )
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
+from cg_dynamics.rollout.compiled import CompiledModel
+from cg_dynamics.walking.impact import impact_function
 from cg_estimation.estimator import ModelEstimator, StampedEstimator
 
 # A sensor of which the model file says nothing: rad or rad/s.

@@ -8,12 +8,12 @@ in    /imu, /hip_encoder, /applied_torque, /foot_contact/inner, /foot_contact/ou
 out   /state, /diagnostics
 """
 
-import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
@@ -21,20 +21,23 @@ from sensor_msgs.msg import Imu, JointState
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
-from cg_dynamics.ros import (
+from cg_estimation.estimator import Estimate
+from cg_estimation.observer_settings import ObserverSettings, make_estimator, tune
+from cg_estimation.samples import Gatherer
+from cg_interfaces import channels, topics
+from cg_interfaces.ros import (
     SENSOR_QOS,
     DeclaredSettings,
     Throttled,
+    publish_status,
     run,
     to_nanoseconds,
     to_stamp,
 )
-from cg_dynamics.settings import setting
-from cg_estimation.estimator import Estimate
-from cg_estimation.observer_settings import ObserverSettings, make_estimator, tune
-from cg_estimation.samples import Gatherer
+from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
+ROBOT = channels.mechanism('compass_gait')
 LOADED = 0.5  # N, or the 1 of a plain switch
 ROTOR = 'hip_rotor'
 NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
@@ -84,16 +87,18 @@ class ObserverNode(Node):
         self._last_ns = 0
         self._begun = False
         self._first_heard: float | None = None
-        self.publisher = self.create_publisher(JointState, '/state', SENSOR_QOS)
-        self.diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.publisher = self.create_publisher(JointState, topics.STATE, SENSOR_QOS)
+        self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         self.applied = self.create_subscription(
-            JointState, '/applied_torque', self.on_torque, SENSOR_QOS
+            JointState, topics.APPLIED_TORQUE, self.on_torque, SENSOR_QOS
         )
         for kind, topic, heard in (
-            (JointState, '/hip_encoder', self.on_encoder),
-            (WrenchStamped, '/foot_contact/inner', lambda m: self.on_contact('inner', m)),
-            (WrenchStamped, '/foot_contact/outer', lambda m: self.on_contact('outer', m)),
-            (Imu, '/imu', self.on_imu),
+            (JointState, topics.HIP_ENCODER, self.on_encoder),
+            *(
+                (WrenchStamped, topics.FOOT_CONTACT.format(leg=leg), partial(self.on_contact, leg))
+                for leg in STANCES
+            ),
+            (Imu, topics.IMU, self.on_imu),
         ):
             self.create_subscription(kind, topic, heard, SENSOR_QOS)
         self.started = True
@@ -106,9 +111,7 @@ class ObserverNode(Node):
 
     def on_encoder(self, message: JointState) -> None:
         """Hip angle."""
-        if 'hip' in message.name and len(message.position) == len(message.name):
-            angle = message.position[message.name.index('hip')]
-            self._take(to_nanoseconds(message.header.stamp), {'hip_angle': angle})
+        self._read(message, ROBOT.topics[topics.HIP_ENCODER])
 
     def on_contact(self, leg: str, message: WrenchStamped) -> None:
         """Foot contact."""
@@ -118,15 +121,16 @@ class ObserverNode(Node):
 
     def on_imu(self, message: Imu) -> None:
         """Lean of the inner legs, docs/interfaces.md, and its rate."""
-        outputs = {}
-        if message.orientation_covariance[0] != -1.0:
-            q = message.orientation
-            outputs['imu_angle'] = math.atan2(
-                2.0 * (q.w * q.y - q.x * q.z), 1.0 - 2.0 * (q.x**2 + q.y**2)
-            )
-        if message.angular_velocity_covariance[0] != -1.0:
-            outputs['imu_rate'] = message.angular_velocity.y
-        self._take(to_nanoseconds(message.header.stamp), outputs)
+        self._read(message, ROBOT.topics[topics.IMU])
+
+    def _read(self, message: Imu | JointState, topic: channels.Topic) -> None:
+        try:
+            outputs = channels.extract(message, topic)
+        except ValueError as error:
+            self.get_logger().warning(f'{topic.name}: {error}', throttle_duration_sec=1.0)
+            return
+        if outputs or topic.name == topics.IMU:
+            self._take(to_nanoseconds(message.header.stamp), outputs)
 
     def _take(self, stamp_ns: int, outputs: dict[str, float]) -> None:
         if stamp_ns < self._last_ns - REPEATED_START:
@@ -195,10 +199,7 @@ class ObserverNode(Node):
                 'samples_out_of_order': self.estimator.ignored,
                 'longest_step_ms': f'{1e3 * self._longest:.3f}',
             }
-            status.values = [KeyValue(key=k, value=str(v)) for k, v in counts.items()]
-            array = DiagnosticArray(status=[status])
-            array.header.stamp = to_stamp(time.time_ns())
-            self.diagnostics.publish(array)
+            publish_status(self.diagnostics, status, counts)
             self._published = self._withheld = self.estimator.restarts = 0
             self._longest = 0.0
         return max(0.0, self._next_diagnosis - now)

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_dynamics.settings import Settings, setting
 from cg_estimation.derivative import Derivative
 from cg_estimation.estimator import StampedEstimator
 from cg_estimation.high_gain import FORMS, HighGainObserver
 from cg_estimation.kalman import ExtendedKalmanFilter, SteadyKalmanFilter
+from cg_interfaces.settings import Settings, setting
 
 METHODS = (
     'high_gain',

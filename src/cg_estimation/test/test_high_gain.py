@@ -5,10 +5,10 @@ import pytest
 
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
-from cg_dynamics.hybrid import walk
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_dynamics.walking.hybrid import walk
 from cg_estimation.estimator import replay
 from cg_estimation.high_gain import HighGainObserver, sampled_gain
 

@@ -14,9 +14,9 @@ from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
 
 from cg_description.paths import model_path  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 from cg_estimation.observer_node import ObserverNode  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
 pytestmark = pytest.mark.alone
 

@@ -20,7 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces.settings import Settings, setting
 
 NANOSECONDS = 1_000_000_000
 

@@ -18,22 +18,22 @@ out   /torque_command, /diagnostics
 import time
 from dataclasses import dataclass
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
-from cg_dynamics.ros import (
+from cg_hardware.safety import GateSettings, TorqueGate
+from cg_hardware.sensor_publishers import torques_of
+from cg_interfaces import channels, topics
+from cg_interfaces.ros import (
     SENSOR_QOS,
     DeclaredSettings,
     Throttled,
+    publish_status,
     run,
     to_nanoseconds,
-    to_stamp,
 )
-from cg_dynamics.settings import setting
-from cg_hardware import topics
-from cg_hardware.safety import GateSettings, TorqueGate
-from cg_hardware.sensor_publishers import torques_of
+from cg_interfaces.settings import setting
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class GateNodeSettings(GateSettings):
     """Parameters of the gate node."""
 
     mechanism: str = setting(
-        'compass_gait', 'mechanism whose joints are guarded', choices=tuple(topics.JOINTS)
+        'compass_gait', 'mechanism whose joints are guarded', choices=tuple(channels.MECHANISMS)
     )
 
 
@@ -53,14 +53,14 @@ class SafetyGateNode(Node):
         self.declared = DeclaredSettings(self, GateNodeSettings, at_work=lambda: self.started)
         self.started = True
         mechanism = self.declared.values.mechanism
-        self.joints = topics.joints_of(mechanism)
+        self.joints = channels.mechanism(mechanism).joints
         self.gate = TorqueGate(self.declared.values, self.joints)
         self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         self.requests = self.create_subscription(
             JointState, topics.TORQUE_REQUEST, self.on_request, SENSOR_QOS
         )
-        measurement = topics.MEASUREMENT[mechanism]
+        measurement = channels.mechanism(mechanism).measurement
         self.measurements = self.create_subscription(
             Imu if measurement == topics.IMU else JointState,
             measurement,
@@ -68,7 +68,7 @@ class SafetyGateNode(Node):
             SENSOR_QOS,
         )
         self.message = JointState(name=list(self.joints))
-        self.message.header.frame_id = topics.TORQUE_FRAME[mechanism]
+        self.message.header.frame_id = channels.mechanism(mechanism).torque.frame_id
         self._measured_ns: int | None = None
         self._stale = True
         self.doubts = 0  # since the node started
@@ -138,13 +138,8 @@ class SafetyGateNode(Node):
         status.message = 'no requests' if self._stale else 'passing'
         if self.gate.rivalry:
             status.level, status.message = DiagnosticStatus.ERROR, self.gate.rivalry
-        status.values = [
-            KeyValue(key='requests_in_doubt', value=str(news)),
-            KeyValue(key='publishers', value=str(self.gate.publishers)),
-        ]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = to_stamp(time.time_ns())
-        self.diagnostics.publish(array)
+        values = {'requests_in_doubt': news, 'publishers': self.gate.publishers}
+        publish_status(self.diagnostics, status, values)
         self._told = self.doubts
 
     def close(self) -> None:

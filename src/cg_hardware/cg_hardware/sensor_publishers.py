@@ -8,8 +8,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Int64
 
-from cg_dynamics.ros import MACHINE_QOS, to_stamp
-from cg_hardware import topics
+from cg_interfaces import channels, topics
+from cg_interfaces.ros import MACHINE_QOS, to_stamp
 
 
 class SensorPublishers:
@@ -23,14 +23,14 @@ class SensorPublishers:
             mechanism: Name of the mechanism, a row of docs/interfaces.md.
             variances: Channel -> variance of its noise, for the covariances of the IMU.
         """
-        self.joints = topics.joints_of(mechanism)
+        self.joints = channels.mechanism(mechanism).joints
         self._publish_parts = {
             'compass_gait': self._publish_compass_gait,
             'pendulum': self._publish_pendulum,
             'double_pendulum': self._publish_double_pendulum,
         }[mechanism]
         self.applied = JointState(name=list(self.joints))
-        self.applied.header.frame_id = topics.TORQUE_FRAME[mechanism]
+        self.applied.header.frame_id = channels.mechanism(mechanism).torque.frame_id
         self.publishers: dict[str, Any] = {}
         self._publisher(node, JointState, topics.APPLIED_TORQUE)
         if mechanism == 'compass_gait':
@@ -38,7 +38,7 @@ class SensorPublishers:
         else:
             self._publisher(node, JointState, topics.JOINT_STATES)
             self.joint_states = JointState(name=list(self.joints))
-            self.joint_states.header.frame_id = topics.TORQUE_FRAME[mechanism]
+            self.joint_states.header.frame_id = channels.mechanism(mechanism).torque.frame_id
 
     def _publisher(self, node: Node, kind: type, topic: str) -> None:
         self.publishers[topic] = node.create_publisher(kind, topic, MACHINE_QOS)

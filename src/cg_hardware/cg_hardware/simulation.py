@@ -13,7 +13,7 @@ from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
-from cg_dynamics.settings import Settings, setting
+from cg_interfaces.settings import Settings, setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
 SOFTWARE = 'compass-gait 0.1.0'

@@ -20,7 +20,7 @@ import time
 from datetime import datetime, timezone
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -29,17 +29,6 @@ from std_msgs.msg import Header, String
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.ros import (
-    IDLE_POLL,
-    LATCHED_QOS,
-    SENSOR_QOS,
-    DeclaredSettings,
-    Throttled,
-    run,
-    to_nanoseconds,
-    to_stamp,
-)
-from cg_hardware import topics
 from cg_hardware.safety import GateSettings, TorqueGate
 from cg_hardware.sensor_publishers import SensorPublishers, torques_of
 from cg_hardware.simulation import (
@@ -56,6 +45,18 @@ from cg_hardware.simulation import (
     ticks_of,
 )
 from cg_hardware.standing import Standing
+from cg_interfaces import topics
+from cg_interfaces.ros import (
+    IDLE_POLL,
+    LATCHED_QOS,
+    SENSOR_QOS,
+    DeclaredSettings,
+    Throttled,
+    publish_status,
+    run,
+    to_nanoseconds,
+    to_stamp,
+)
 
 RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
 LATE = 0.02  # s behind the clock that are worth a warning
@@ -494,10 +495,7 @@ class SimulationNode(LifecycleNode):
                 self.pace.forget()
             if self.gate.rivalry:
                 status.level, status.message = DiagnosticStatus.ERROR, self.gate.rivalry
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = to_stamp(time.time_ns())
-        self.diagnostics.publish(array)
+        publish_status(self.diagnostics, status, values)
         self._faults = 0
 
     def close(self) -> None:

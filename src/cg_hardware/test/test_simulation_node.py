@@ -21,11 +21,11 @@ from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from cg_description.paths import model_path  # noqa: E402
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 from cg_hardware.simulation import SimulationSettings  # noqa: E402
 from cg_hardware.simulation_node import SimulationNode  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
 pytestmark = pytest.mark.alone
 

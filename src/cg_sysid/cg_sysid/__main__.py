@@ -2,7 +2,7 @@
 
 import sys
 
-from cg_sysid.command import main
+from cg_sysid.cli.command import main
 
 if __name__ == '__main__':
     sys.exit(main())

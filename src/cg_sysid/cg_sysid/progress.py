@@ -15,7 +15,7 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from cg_dynamics.c_compiler import seconds_under_way
+from cg_dynamics.rollout.compiler import seconds_under_way
 from cg_sysid import parallel
 
 EVERY = 8.0  # s between lines: what keeps Python itself busy may delay one by a second or two

@@ -7,14 +7,14 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.bags import write_bag
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnose_cli import diagnosis_curves
-from cg_sysid.diagnosis import Options
-from cg_sysid.diagnosis_file import diagnosis_facts
-from cg_sysid.intake import take_in
+from cg_sysid.checks.loading import take_in
+from cg_sysid.cli.diagnose import diagnosis_curves
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.provenance import provenance
-from cg_sysid.rehearse import rehearse
+from cg_sysid.records.bags import write_bag
+from cg_sysid.report.diagnosis_file import diagnosis_facts
 
 BIAS = 0.8  # N m, hidden in the machine
 EFFECTS = ('torque_bias', 'quadratic_friction')

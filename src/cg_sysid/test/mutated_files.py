@@ -16,9 +16,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from cg_sysid import bag_file
-from cg_sysid.mcap_records import CHUNK, MAGIC, RECORD
-from cg_sysid.recorder import Recording
+from cg_sysid.records import bag_file
+from cg_sysid.records.mcap_records import CHUNK, MAGIC, RECORD
+from cg_sysid.records.recorder import Recording
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, STRING = 'sensor_msgs/msg/JointState', 'std_msgs/msg/String'

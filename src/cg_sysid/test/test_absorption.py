@@ -5,10 +5,10 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 
 DURATION, SAMPLE = 3.0, 0.004  # s; the ringing has 20 samples in a turn
 MACHINES = {

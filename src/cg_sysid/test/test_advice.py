@@ -3,13 +3,14 @@
 import pytest
 
 from cg_dynamics.model import Model
-from cg_sysid.advice import imagined
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import MARGIN, Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import experiments_for, load_experiment
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.experiment_design import imagined
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.catalogue import experiments_for, load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.search.ranking import MARGIN
 
 EFFECTS = ('ankle_friction', 'spring_damping', 'aerodynamic_drag', 'torque_bias')
 

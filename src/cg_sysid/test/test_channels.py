@@ -5,7 +5,7 @@ from types import SimpleNamespace as Message
 import numpy as np
 import pytest
 
-from cg_sysid import channels
+from cg_interfaces import channels
 
 IMU = channels.mechanism('compass_gait').topics['/imu']
 JOINTS = channels.mechanism('double_pendulum').topics['/joint_states']

@@ -10,10 +10,11 @@ import pytest
 import yaml
 from rich.console import Console
 
-from cg_sysid import bags, check
-from cg_sysid.check import check_recording
-from cg_sysid.findings import OVERRULABLE
-from cg_sysid.synthetic import Synthesis, synthesise
+from cg_sysid.checks import recordings as check
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
+from cg_sysid.records import bags
+from cg_sysid.records.findings import OVERRULABLE
 
 SAMPLES = 4000  # 8 s at 500 Hz
 # bench/evidence.py has more draws of each, and bench/check_rates.py many.

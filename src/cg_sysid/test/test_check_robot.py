@@ -10,16 +10,16 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid import spoil
-from cg_sysid.bags import read_bag, to_record, write_bag
-from cg_sysid.check import check_recording
-from cg_sysid.diagnosis_file import unusable_facts
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.intake import take_in
-from cg_sysid.rehearse import rehearse
+from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments import fault_injection as spoil
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
+from cg_sysid.records.bags import read_bag, to_record, write_bag
+from cg_sysid.report.diagnosis_file import unusable_facts
 from cg_sysid.report.page import render
-from cg_sysid.synthetic import Synthesis, synthesise
 
 MODEL = model_path('compass_gait_mit')
 SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',

@@ -11,8 +11,12 @@ from rich.console import Console
 
 from cg_description.paths import model_names
 from cg_dynamics.model import Model
-from cg_sysid import cli, diagnose_cli, identify_cli, parallel, report_cli
-from cg_sysid.bags import read_bag, write_bag
+from cg_sysid import parallel
+from cg_sysid.cli import common as cli
+from cg_sysid.cli import diagnose as diagnose_cli
+from cg_sysid.cli import identify as identify_cli
+from cg_sysid.cli import report as report_cli
+from cg_sysid.records.bags import read_bag, write_bag
 
 EFFECTS = 'torque_bias,quadratic_friction'
 

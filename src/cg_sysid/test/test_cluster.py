@@ -21,10 +21,10 @@ from cg_dynamics import cluster
 from cg_dynamics.cluster import FETCHES, _fetched
 from cg_dynamics.model import Model
 from cg_sysid import cluster as ours
-from cg_sysid import diagnose_cli
+from cg_sysid.cli import diagnose as diagnose_cli
 from cg_sysid.cluster import Cluster, ClusterError
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
 from cg_sysid.parallel import run_all
 
 distributed = pytest.importorskip('distributed', reason='the cluster part is not installed')
@@ -169,7 +169,7 @@ def test_the_command_line_fits_on_the_cluster_and_can_be_interrupted(
     words = ['--model', str(model_file), '--out', str(tmp_path), '--scheduler', processes.address]
     with processes.client() as client:
         program = subprocess.Popen(
-            [sys.executable, '-m', 'cg_sysid.diagnose_cli', *words, *map(str, bags)],
+            [sys.executable, '-m', 'cg_sysid.cli.diagnose', *words, *map(str, bags)],
             env=processes.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             # Jobs in the background of a shell ignore SIGINT, and all that they start.
             preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cg_sysid.command import COMMANDS, LAUNCHER, main
+from cg_sysid.cli.command import COMMANDS, LAUNCHER, main
 
 
 def test_help_lists_every_command_in_one_line_each(capsys):

@@ -13,13 +13,15 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid import diagnose_cli, identify, kept_fits, parallel
+from cg_sysid import parallel
+from cg_sysid.cli import diagnose as diagnose_cli
 from cg_sysid.deadline import Deadline, OutOfTime, check_time
-from cg_sysid.diagnose import Options, diagnose
-from cg_sysid.identify import fit
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
-from cg_sysid.unknowns import IdentificationError
+from cg_sysid.diagnosis.diagnose import Options, diagnose
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification import identify, kept_fits
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.unknowns import IdentificationError
 
 EFFECTS = ('torque_bias', 'sensor_delay', 'quadratic_friction')
 MORE = (*EFFECTS, 'payload', 'actuator_lag', 'aerodynamic_drag', 'stribeck_friction')
@@ -227,7 +229,7 @@ def test_the_command_line_answers_in_time_and_goes_on(bags, model_file, tmp_path
 
 def test_an_interrupt_ends_with_the_best_so_far(bags, model_file, tmp_path):
     """SIGINT to a command at work: an answer, files of it, and fits to go on from."""
-    command = [sys.executable, '-m', 'cg_sysid.diagnose_cli', '--model', str(model_file),
+    command = [sys.executable, '-m', 'cg_sysid.cli.diagnose', '--model', str(model_file),
                '--out', str(tmp_path / 'out'), '--effects', ','.join(MORE), '--workers', '1',
                *map(str, bags)]  # fmt: skip
     started = subprocess.Popen(

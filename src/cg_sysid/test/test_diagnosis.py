@@ -8,10 +8,12 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnose import diagnose, verdict_of
-from cg_sysid.diagnosis import Cause, Options, contains, summary_of
-from cg_sysid.gain import Gain
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose, verdict_of
+from cg_sysid.diagnosis.result import Cause, Options
+from cg_sysid.diagnosis.summary import summary_of
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.gain import Gain
+from cg_sysid.search.ranking import contains
 
 
 def test_a_ratio_is_printed_without_a_unit_and_a_torque_with_its_own():

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cg_dynamics.model import Model
-from cg_sysid import curves
-from cg_sysid.diagnosis_file import (
+from cg_sysid.report import curves
+from cg_sysid.report.diagnosis_file import (
     interval,
     plain,
     read_facts,

@@ -9,15 +9,15 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, events_of, try_candidate
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.identify import fit
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.simulation_error import Problem, evaluate, moved, reduced
+from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.report.wording import event_words
-from cg_sysid.simulation_error import Problem, evaluate, moved, reduced
-from cg_sysid.trial import prepare
-from cg_sysid.unknowns import unknowns_of
+from cg_sysid.search.candidates import Task, events_of, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 ZEROS = (0.011, -0.007, 0.004, -0.012)

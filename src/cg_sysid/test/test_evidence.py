@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import wilcoxon
 
-from cg_sysid.evidence import (
+from cg_sysid.identification.information_criterion import (
     CORRELATION_S,
     block_gain,
     correlation_time,

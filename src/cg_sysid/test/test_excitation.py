@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cg_sysid.excitation import (
+from cg_sysid.experiments.excitation import (
     ExcitationSettings,
     crest_factor,
     make_signal,

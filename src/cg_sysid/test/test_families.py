@@ -10,8 +10,8 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
 
 CYCLES, PHASE = 18.23, 0.82
 

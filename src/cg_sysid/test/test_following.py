@@ -9,9 +9,11 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.bags import write_bag
-from cg_sysid.diagnose import judging_whole
-from cg_sysid.following import (
+from cg_sysid.checks.loading import take_in
+from cg_sysid.diagnosis.diagnose import judging_whole
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.windows import (
     FOLLOWED,
     SHORTEST_WINDOW,
     Followed,
@@ -20,9 +22,7 @@ from cg_sysid.following import (
     sensitivities,
     windows_of,
 )
-from cg_sysid.intake import take_in
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.records.bags import write_bag
 
 G = 9.81  # m/s^2
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))

@@ -8,10 +8,10 @@ from scipy.signal import cont2discrete, lfilter
 from cg_description.paths import model_path
 from cg_dynamics.linearise import linearise, without_dry_friction
 from cg_dynamics.model import Model
-from cg_sysid.bags import write_bag
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.experiments import load_experiment
-from cg_sysid.frequency_response import (
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.frequency_response import (
     analyse,
     flexible_start,
     magnitude_trace,
@@ -20,8 +20,8 @@ from cg_sysid.frequency_response import (
     response,
     seat,
 )
-from cg_sysid.record import Record
-from cg_sysid.rehearse import rehearse
+from cg_sysid.records.bags import write_bag
+from cg_sysid.records.record import Record
 
 T = 0.002
 SETUP = load_experiment('spring_stabilised_inner').setup

@@ -15,10 +15,10 @@ from mujoco_robot import Hidden, simulate_mujoco, two_links
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.record import Record
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.records.record import Record
 
 SAMPLE = 0.004
 DURATION = 4.0

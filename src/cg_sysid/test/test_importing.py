@@ -14,16 +14,16 @@ import scipy.io
 import yaml
 from scipy.optimize import least_squares
 
-from cg_sysid import importing
-from cg_sysid.bags import read_bag
-from cg_sysid.check import check_recording
+from cg_sysid.checks.recordings import check_recording
 from cg_sysid.errors import RecordingError
-from cg_sysid.expressions import evaluate
-from cg_sysid.importing import import_logs, import_to_bags
-from cg_sysid.noise import measure_noise
-from cg_sysid.record import NS_PER_S
-from cg_sysid.tables import read_table
-from cg_sysid.trial import recording_of
+from cg_sysid.identification.data_set import recording_of
+from cg_sysid.records import importing
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.expressions import evaluate
+from cg_sysid.records.importing import import_logs, import_to_bags
+from cg_sysid.records.noise import measure_noise
+from cg_sysid.records.record import NS_PER_S
+from cg_sysid.records.tables import read_table
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 DATA = Path(os.environ.get('CG_DATA', REPOSITORY.parent / 'shared' / 'data'))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from cg_dynamics.rig import Setup
-from cg_sysid.channels import mechanism
-from cg_sysid.check import check_recording
-from cg_sysid.late_samples import late_samples
-from cg_sysid.synthetic import Synthesis, synthesise
-from cg_sysid.trial import Trial
+from cg_interfaces.channels import mechanism
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.diagnosis.late_samples import late_samples
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
+from cg_sysid.identification.data_set import Trial
 
 SIGMA = 4e-4  # s RMS
 RATE = 500.0

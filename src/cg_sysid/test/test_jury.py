@@ -8,12 +8,12 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, fit_to_all, try_candidate
-from cg_sysid.identify import score
-from cg_sysid.imperfections import with_imperfections
-from cg_sysid.jury import Jury
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import score
+from cg_sysid.search.candidates import Task, fit_to_all, try_candidate
+from cg_sysid.search.model_selection import Jury
+from cg_sysid.search.nuisance import with_imperfections
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 TWINS = 'foot_compliance', 'spring_nonlinearity'  # where springs may be off a little besides

@@ -13,24 +13,24 @@ from walking import NOISE, QUANTUM, RATE, SLOPE, stepping_command, walking
 from walking_records import as_record
 
 from cg_description.paths import model_path
-from cg_dynamics.contact import Ground, contact_law
 from cg_dynamics.effects.effect import ContactLaw
-from cg_dynamics.gait import section_state
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.contact_fit import ContactTask, fit_contact
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.diagnosis_file import diagnosis_facts
-from cg_sysid.impulse import measure_impulse
-from cg_sysid.intake import Intake
-from cg_sysid.landing_jury import judge_landings
-from cg_sysid.landings import ready, simulate_passage
-from cg_sysid.phases import cut_steps
-from cg_sysid.record import Record
+from cg_dynamics.walking.contact import Ground, contact_law
+from cg_dynamics.walking.gait import section_state
+from cg_sysid.checks.loading import Intake
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.identification.data_set import noise_floor
+from cg_sysid.landings.contact_fit import ContactTask, fit_contact
+from cg_sysid.landings.impulse import measure_impulse
+from cg_sysid.landings.landings import ready, simulate_passage
+from cg_sysid.landings.selection import judge_landings
+from cg_sysid.records.record import Record
+from cg_sysid.report.diagnosis_file import diagnosis_facts
 from cg_sysid.report.landings import landings as card
 from cg_sysid.report.wording import lead
-from cg_sysid.trial import noise_floor
+from cg_sysid.stances.phases import cut_steps
 
 # One process makes the walks for all of these tests.
 pytestmark = pytest.mark.xdist_group('landings')

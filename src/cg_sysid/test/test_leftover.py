@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_sysid.curves import Curve
-from cg_sysid.leftover import WORTH_NAMING, explained, followed, leftover
+from cg_sysid.report.curves import Curve
+from cg_sysid.report.residual_analysis import WORTH_NAMING, explained, followed, leftover
 
 
 def curve(acceleration, seed=0):

@@ -8,12 +8,12 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.diagnose import diagnose, led_in
-from cg_sysid.diagnosis import Options
-from cg_sysid.identify import score
-from cg_sysid.measured_start import judged
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.diagnosis.diagnose import diagnose, led_in
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import score
+from cg_sysid.identification.measured_start import judged
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 

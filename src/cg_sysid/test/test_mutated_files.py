@@ -22,11 +22,11 @@ from mutated_files import (
     write_own_bag,
 )
 
-from cg_sysid.bags import read_bag
 from cg_sysid.errors import RecordingError
-from cg_sysid.mcap_records import LARGEST_CHUNK, MAGIC
-from cg_sysid.mcap_scan import survey
-from cg_sysid.recover import RecoveryError, is_damaged, main, recover
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.mcap_records import LARGEST_CHUNK, MAGIC
+from cg_sysid.records.mcap_scan import survey
+from cg_sysid.records.recover import RecoveryError, is_damaged, main, recover
 
 MUTANTS = 3  # of each kind of file and damage; bench/mutated_bags.py takes 10^5
 NOTE = {'mechanism': 'pendulum', 'setup': {}}  # the one in the bag is in the damaged chunk

@@ -11,7 +11,7 @@ from cg_dynamics.mechanisms import MECHANISMS
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
-from cg_sysid.new_model import example_of, main, template
+from cg_sysid.cli.new_model import example_of, main, template
 
 ROOT = Path(__file__).resolve().parents[3]
 

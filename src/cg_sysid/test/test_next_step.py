@@ -9,9 +9,9 @@ from test_report import with_verdict
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.cli import print_next
-from cg_sysid.diagnosis_file import VERDICTS
-from cg_sysid.next_step import CHECKS, next_step
+from cg_sysid.diagnosis.next_step import CHECKS, next_step
 from cg_sysid.report import render
+from cg_sysid.report.diagnosis_file import VERDICTS
 
 PROPOSAL = {
     'experiment': 'legs_tied', 'excitation': {'kind': 'multisine', 'f_max': 8.0},

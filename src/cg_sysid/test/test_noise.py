@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cg_sysid.noise import channel_noise, contrasts, resolution, white_sigma
+from cg_sysid.records.noise import channel_noise, contrasts, resolution, white_sigma
 
 SEEDS = range(8)
 

@@ -5,10 +5,10 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.identify import fit
-from cg_sysid.rehearse import rehearse
-from cg_sysid.simulation_error import Border, Point, reduced
-from cg_sysid.trial import prepare
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.simulation_error import Border, Point, reduced
 
 
 def _point(own_hessian, coupling, own_gradient):

@@ -11,14 +11,14 @@ from walking_records import as_record
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.bags import write_bag
-from cg_sysid.check import check_recording
-from cg_sysid.diagnose import split
-from cg_sysid.intake import take_in
-from cg_sysid.phases import cut_steps
-from cg_sysid.rehearse import rehearse
-from cg_sysid.touchdown import Pieces, find_touchdowns
-from cg_sysid.trial import prepare
+from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.diagnosis.diagnose import split
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.records.bags import write_bag
+from cg_sysid.stances.phases import cut_steps
+from cg_sysid.stances.touchdown import Pieces, find_touchdowns
 
 MODEL = model_path('compass_gait_mit')
 # The instant of a landing is not sampled, noise moves where the legs pose as they do there by a
@@ -117,7 +117,7 @@ def on_blocks(model, stance='inner', kick=None, seed=0):
 
 
 def _pinned_walk(model, stance, start, torque):
-    from cg_dynamics.hybrid import WalkOptions, walk
+    from cg_dynamics.walking.hybrid import WalkOptions, walk
 
     options = WalkOptions(minimum_step=10.0, sample_time=0.002)
     done = walk(model, stance, start, 0.8, torque, options)

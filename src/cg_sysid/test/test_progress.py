@@ -7,16 +7,16 @@ import time
 import numpy as np
 import pytest
 
-from cg_dynamics import c_compiler
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout import compiler as c_compiler
 from cg_sysid import parallel, progress
-from cg_sysid.diagnose import Options, diagnose
-from cg_sysid.identify import fit
-from cg_sysid.nelder_mead import nelder_mead
+from cg_sysid.diagnosis.diagnose import Options, diagnose
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.nelder_mead import nelder_mead
 from cg_sysid.progress import EVERY, Bars, Lines, Stage
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
 
 TICK = 0.05  # s
 

@@ -13,10 +13,10 @@ from unlisted import SETUPS, hide
 
 from cg_dynamics.effects.effect import TIME, StanceEffect
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.rehearse import rehearse
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 
 SAMPLE = 0.002
 DURATION = 4.0

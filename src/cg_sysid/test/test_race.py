@@ -8,19 +8,19 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import (
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import pieces, prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.search.candidates import (
     Task,
     events_of,
     first_seconds,
     own_parameters,
     try_candidate,
 )
-from cg_sysid.events import undisturbed
-from cg_sysid.identify import fit
-from cg_sysid.imperfections import with_imperfections
-from cg_sysid.race import IDLE, Race, worth_having
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import pieces, prepare
+from cg_sysid.search.events import undisturbed
+from cg_sysid.search.nuisance import with_imperfections
+from cg_sysid.search.successive_halving import IDLE, Race, worth_having
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values

@@ -5,7 +5,7 @@ import pytest
 
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import RecordingError
-from cg_sysid.record import NS_PER_S, Record, hold, merge_stamps, place
+from cg_sysid.records.record import NS_PER_S, Record, hold, merge_stamps, place
 
 START = 1_300_000_000 * NS_PER_S
 

@@ -17,12 +17,13 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from cg_dynamics.domains import own_domain  # noqa: E402
-from cg_dynamics.ros import LATCHED_QOS, MACHINE_QOS, to_stamp  # noqa: E402
-from cg_sysid.recover import needs_recovery, recover  # noqa: E402
+from cg_interfaces.domains import own_domain  # noqa: E402
+from cg_interfaces.ros import LATCHED_QOS, MACHINE_QOS, to_stamp  # noqa: E402
+from cg_sysid.records.recover import needs_recovery, recover  # noqa: E402
 
 pytestmark = pytest.mark.alone
 
+RECORDER = 'cg_sysid.records.recorder_node'
 PERIOD = 0.002  # s
 LOSS = 0.02  # s
 TOPICS = {
@@ -92,7 +93,7 @@ class Sender:
 
 def start_recorder(bag, **options):
     return subprocess.Popen(
-        [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p', f'bag:={bag}'],
+        [sys.executable, '-m', RECORDER, '--ros-args', '-p', f'bag:={bag}'],
         **options,
     )
 
@@ -188,7 +189,7 @@ def test_started_while_data_flow_the_bag_begins_with_all_topics_and_the_note(tmp
     [("bag:=''", 'bag is empty'), ('also:=[/x]', 'not of the form'), ('depth:=1', 'depth')],
 )
 def test_wrong_parameters_end_the_node_with_their_reason(tmp_path, parameter, message):
-    command = [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p', parameter]
+    command = [sys.executable, '-m', RECORDER, '--ros-args', '-p', parameter]
     if not parameter.startswith('bag'):
         command += ['-p', f'bag:={tmp_path / "bag"}']
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)

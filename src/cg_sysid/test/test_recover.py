@@ -10,8 +10,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.typesys import Stores, get_typestore
 
-from cg_sysid.recorder import Recording
-from cg_sysid.recover import JOURNAL_NAME, RecoveryError, main, needs_recovery, recover
+from cg_sysid.records.recorder import Recording
+from cg_sysid.records.recover import JOURNAL_NAME, RecoveryError, main, needs_recovery, recover
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = 'sensor_msgs/msg/JointState'

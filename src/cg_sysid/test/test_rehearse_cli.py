@@ -5,9 +5,9 @@ import pytest
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.bags import read_bag
-from cg_sysid.check import check_recording
-from cg_sysid.command import main
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.cli.command import main
+from cg_sysid.records.bags import read_bag
 
 
 def test_a_rehearsal_is_a_recording_that_passes_every_check(tmp_path, capsys):

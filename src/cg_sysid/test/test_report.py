@@ -8,8 +8,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from cg_sysid.diagnosis_file import VERDICTS
 from cg_sysid.report import render
+from cg_sysid.report.diagnosis_file import VERDICTS
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.signals import MISSING, STEPS, quantised, spectra
 from cg_sysid.report.wording import headline, lead

@@ -8,8 +8,8 @@ from importlib import resources
 import pytest
 from test_report import VOID, with_verdict
 
-from cg_sysid.diagnosis_file import VERDICTS
 from cg_sysid.report import render
+from cg_sysid.report.diagnosis_file import VERDICTS
 from cg_sysid.report.tried import DEEPEST
 
 LEGIBLE = 4.5  # contrast of text, WCAG 2.2, 1.4.3

@@ -6,7 +6,7 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.resting import resting_band
+from cg_sysid.checks.resting import resting_band
 
 PENDULUM = Model.load(model_path('sydney_pendulum'))
 

@@ -8,27 +8,27 @@ from cart_pole import FILE, cart, install
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid import channels
-from cg_sysid.bag_writer import write_bag
-from cg_sysid.channels import JOINT_STATE, Channel, Mechanism, Topic
-from cg_sysid.check import check_recording
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnose_cli import diagnosis_curves
-from cg_sysid.diagnosis import Options
-from cg_sysid.diagnosis_file import diagnosis_facts
-from cg_sysid.identify import fit
-from cg_sysid.intake import take_in
+from cg_interfaces import channels, topics
+from cg_interfaces.channels import JOINT_STATE, Channel, Mechanism, Topic
+from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.cli.diagnose import diagnosis_curves
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
 from cg_sysid.provenance import provenance
-from cg_sysid.rehearse import rehearse
+from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.report import render
+from cg_sysid.report.diagnosis_file import diagnosis_facts
 from cg_sysid.report.signals import payload
-from cg_sysid.trial import prepare
 
 FORCE = (Channel('force', 'N', 'effort', 'rail'),)
 TOPICS = Mechanism(
     'cart_pole',
-    *(Topic(name, JOINT_STATE, 'rail', FORCE, required=name == channels.APPLIED_TORQUE)
-      for name in (channels.APPLIED_TORQUE, channels.TORQUE_COMMAND)),
+    *(Topic(name, JOINT_STATE, 'rail', FORCE, required=name == topics.APPLIED_TORQUE)
+      for name in (topics.APPLIED_TORQUE, topics.TORQUE_COMMAND)),
     (),
     (Topic('/joint_states', JOINT_STATE, 'rail', (
         Channel('position', 'm', 'position', 'rail'),

@@ -7,14 +7,15 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, look_at, one_minimum
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import MARGIN, Options
-from cg_sysid.experiments import load_experiment
-from cg_sysid.identify import fit
-from cg_sysid.imperfections import SOUND, as_sound_robots, imperfect, with_imperfections
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.catalogue import load_experiment
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.search.candidates import Task, look_at, one_minimum
+from cg_sysid.search.nuisance import SOUND, as_sound_robots, imperfect, with_imperfections
+from cg_sysid.search.ranking import MARGIN
 
 EFFECTS = (
     'torque_bias', 'encoder_offset', 'actuator_delay', 'actuator_lag', 'quadratic_friction',

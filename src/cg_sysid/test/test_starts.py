@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import parameter_vector
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects.effect import START_TORQUE
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import THOROUGH_ITERATIONS, Task, own_parameters, try_candidate
-from cg_sysid.identify import fit, predict, score
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import pieces, prepare
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import pieces, prepare
+from cg_sysid.identification.identify import fit, predict, score
+from cg_sysid.search.candidates import THOROUGH_ITERATIONS, Task, own_parameters, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 

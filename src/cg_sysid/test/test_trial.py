@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_dynamics.compiled import compile_model
 from cg_dynamics.effects.effect import SESSION_TIME, TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, candidates_for, events_of, try_candidate
-from cg_sysid.diagnose import split
-from cg_sysid.identify import fit
-from cg_sysid.imperfections import turning
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.diagnosis.diagnose import split
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.search.candidates import Task, candidates_for, events_of, try_candidate
+from cg_sysid.search.nuisance import turning
 
 
 def test_model_gets_torque_time_and_switches_in_its_order(model_file):

@@ -9,15 +9,16 @@ import pytest
 from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.candidates import Task, try_candidate
-from cg_sysid.diagnosis import Cause, summary_of
-from cg_sysid.gain import Gain
-from cg_sysid.identify import fit
-from cg_sysid.jury import Jury
-from cg_sysid.rehearse import rehearse
-from cg_sysid.shape import Shape
-from cg_sysid.trial import prepare
-from cg_sysid.unmodelled import Unmodelled
+from cg_sysid.diagnosis.result import Cause
+from cg_sysid.diagnosis.summary import summary_of
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.gain import Gain
+from cg_sysid.identification.identify import fit
+from cg_sysid.learned.shape import Shape
+from cg_sysid.learned.unmodelled import Unmodelled
+from cg_sysid.search.candidates import Task, try_candidate
+from cg_sysid.search.model_selection import Jury
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFT = {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.6}

@@ -21,8 +21,8 @@ from unlisted import (
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
 
 SHORT = 4.0  # s, two thirds of what the bench records
 

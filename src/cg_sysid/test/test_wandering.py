@@ -9,15 +9,15 @@ from test_diagnosis_file import documented
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.by_recording import numbers_of, with_own
-from cg_sysid.diagnose import diagnose
-from cg_sysid.diagnosis import Options
-from cg_sysid.diagnosis_file import diagnosis_facts
-from cg_sysid.identify import fit
-from cg_sysid.intake import Intake
-from cg_sysid.rehearse import rehearse
-from cg_sysid.trial import prepare
-from cg_sysid.unknowns import own_unknowns
+from cg_sysid.checks.loading import Intake
+from cg_sysid.diagnosis.by_recording import numbers_of, with_own
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.unknowns import own_unknowns
+from cg_sysid.report.diagnosis_file import diagnosis_facts
 
 SETUP = Setup(springs=tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3)))
 EFFECTS = 'ground_slope', 'quadratic_friction', 'external_push'

@@ -11,8 +11,8 @@ import numpy as np
 
 from cg_dynamics.effects.effect import TIME, Effect, reading_rate
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.excitation import ExcitationSettings, make_signal
-from cg_sysid.rehearse import rehearse
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 
 SAMPLE = 0.004
 DURATION = 6.0

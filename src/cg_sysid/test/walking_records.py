@@ -4,7 +4,7 @@ import numpy as np
 from walking import signals_of
 
 from cg_dynamics.rig import Setup
-from cg_sysid.record import Record
+from cg_sysid.records.record import Record
 
 
 def as_record(name, done, stance, seed=0, mirrored=False, **sensing):

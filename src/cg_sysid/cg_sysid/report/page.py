@@ -6,10 +6,10 @@ from importlib import resources
 from pathlib import Path
 
 from cg_description.model_file import write_atomically
-from cg_sysid.curves import Curve, load
-from cg_sysid.diagnosis_file import FILE_NAMES, Facts, read_facts
-from cg_sysid.faults import FaultSignal
+from cg_sysid.checks.faults import FaultSignal
 from cg_sysid.report import answer, data, fits, tried
+from cg_sysid.report.curves import Curve, load
+from cg_sysid.report.diagnosis_file import FILE_NAMES, Facts, read_facts
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.signals import payload
 from cg_sysid.report.wording import headline

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from cg_sysid.curves import Curve
-from cg_sysid.faults import FaultSignal
+from cg_sysid.checks.faults import FaultSignal
+from cg_sysid.report.curves import Curve
 from cg_sysid.report.wording import input_units
 
 MISSING = 0xFFFF

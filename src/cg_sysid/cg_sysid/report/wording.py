@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cg_sysid.leftover import followed
+from cg_sysid.report.residual_analysis import followed
 from cg_sysid.text import effect_name, listed, measured, number, scaled, sentence
 
 Facts = dict[str, Any]

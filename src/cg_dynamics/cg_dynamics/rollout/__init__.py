@@ -1,0 +1,1 @@
+"""Simulation in compiled code: one record, many side by side, sensitivities."""

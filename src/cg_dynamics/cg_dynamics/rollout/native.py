@@ -1,0 +1,362 @@
+"""Rollouts of one model in machine code: rollout.c for its states, windows.c for sensitivities.
+
+A rollout is simulated once, step by step. Its sensitivities obey linear equations along it, so
+that eight windows of it are integrated side by side in the lanes of one register, by the very
+steps that the rollout took, and chained:
+
+    S(t) = Phi_w(t) S(t_w) + Gamma_w(t)      for t in window w, which begins at t_w
+
+with Phi_w, Gamma_w the derivatives by the window's first state and by the parameters.
+"""
+
+import ctypes
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import Equations
+from cg_dynamics.rollout.compiler import shared_library
+from cg_dynamics.rollout.fallback import EASY, HALVINGS, STABLE, STATE_LIMIT, InterpretedRollout
+from cg_dynamics.rollout.vector_code import (
+    FLAGS,
+    WIDTH,
+    UnsupportedError,
+    vector_code,
+    vector_math,
+)
+
+HERE = Path(__file__).parent
+
+
+class NativeRollout:
+    """The functions of rollout.c for one set of equations; arguments are those of fallback.py.
+
+    Args:
+        equations: The model.
+        free: Names of the parameters with sensitivities.
+    """
+
+    def __init__(self, equations: Equations, free: tuple[str, ...]):
+        self.equations, self.free = equations, free
+        self.nx, self.ny = equations.x.shape[0], equations.outputs.shape[0]
+        loaded = _bind(_states_library(equations))
+        self.cgm_advance, self.cgm_simulate = loaded.cgm_advance, loaded.cgm_simulate
+        self.cgm_outputs = loaded.cgm_outputs
+
+    @functools.cached_property
+    def _windows(self):
+        """The function of windows.c, compiled when sensitivities are first asked for."""
+        return _bind_windows(_windows_library(self.equations, self.free))
+
+    @functools.cached_property
+    def _interpreted(self) -> InterpretedRollout:
+        return InterpretedRollout(self.equations, self.free)
+
+    def cgm_normal(
+        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
+        weight, delay, delay_to, H, g, sse, count, Y, Jacobian,
+    ) -> int:  # fmt: skip
+        """Normal equations of the simulation error (Eq. 4.13).
+
+            H (nc, nc) += sum_kj w_j^2 J'J,  g (nc) += sum_kj w_j^2 J'r,  r = y_sim - y_measured
+            sse (ny) += sum_k w_j^2 r^2,     count (ny) += samples;  NaN marks a missing sample
+
+        Args:
+            n: Rows.
+            time: Their stamps in s, shape (n,).
+            largest: Longest integration step in s.
+            tolerance: Error of a step, in units of the states' scales, from which it is halved.
+            u: Inputs, each held until the next row, shape (n, nu).
+            du: Their derivative by their delay, shape (n, nu).
+            delay_column: Column of that delay, or -1.
+            x0: State at the first row, shape (nx,).
+            S0: Its derivative by the columns, shape (nx, nc).
+            p: Parameter vector.
+            nc: Number of columns.
+            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
+            measured: Outputs, shape (n, ny).
+            weight: Of each output, shape (ny,).
+            delay: Of each output in s, shape (ny,).
+            delay_to: Column of each output's delay or -1, shape (ny,).
+            H: To be added to, as g, sse and count.
+            g: Shape (nc,).
+            sse: Shape (ny,).
+            count: Shape (ny,).
+            Y: Filled with the outputs, shape (n, ny), if not None.
+            Jacobian: Filled with their derivative, shape (n, ny, nc), if not None.
+
+        Returns:
+            Number of rows before the state ran away.
+        """
+        states = np.empty((n, self.nx))
+        rows = np.diff(time)
+        most = max(1, int(np.ceil(rows.max(initial=0.0) / largest)))
+        steps = np.zeros((n, most), np.int32)
+        done = self.cgm_simulate(n, rows, largest, tolerance, u, x0, p, states, most, steps)
+        y = np.empty((done, self.ny))
+        self.cgm_outputs(done, time, u, p, states, delay, y)
+        residual = y - measured[:done]
+        there = np.isfinite(residual)
+        residual = np.where(there, residual, 0.0)
+        sse += ((weight * residual) ** 2).sum(axis=0)
+        count += there.sum(axis=0)
+        if Y is not None:
+            Y[:done] = y
+        if done < n:
+            return done
+        try:
+            kernel = self._windows
+        except UnsupportedError:
+            return self._interpreted.cgm_normal(
+                n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
+                weight, delay, delay_to, H, g, np.zeros(self.ny), np.zeros(self.ny), Y, Jacobian,
+            )  # fmt: skip
+        active = np.flatnonzero(column >= 0)
+        lanes = _Lanes.of(time, float(delay.max(initial=0.0)), self.nx, len(active), delay_column)
+        place = np.full(len(column), -1, np.int32)
+        place[active] = self.nx + np.arange(len(active))
+        own_delay = {column[f]: place[f] for f in active}
+        k = lanes.columns
+        hessian, gradient = np.zeros((WIDTH, k, k)), np.zeros((WIDTH, k))
+        handed = np.zeros((WIDTH, self.nx, k))
+        by_lane = None if Jacobian is None else np.zeros((n, self.ny, k))
+        if not kernel(
+            lanes.first, lanes.length, lanes.start, lanes.until, lanes.handed, time, largest,
+            u, du, p, k, place, lanes.late, states, most, steps, residual, there * weight,
+            delay,
+            np.array([own_delay.get(c, -1) for c in delay_to], np.int32), hessian, gradient,
+            handed, by_lane,
+        ):  # fmt: skip
+            raise MemoryError(f'no memory for the sensitivities of {n} rows of late sensors')
+        chain = np.zeros((lanes.count, k, nc))  # d(a window's columns)/d(columns)
+        chain[:, self.nx + np.arange(len(active)), column[active]] = 1.0
+        if lanes.late >= 0:
+            chain[:, lanes.late, delay_column] = 1.0
+        chain[0, : self.nx] = S0
+        used = slice(lanes.count)
+        # Sensitivities of a motion that runs away do so too; whoever fits sees it by these sums.
+        with np.errstate(over='ignore', invalid='ignore'):
+            for w in range(1, lanes.count):
+                chain[w, : self.nx] = handed[w - 1] @ chain[w - 1]
+            H += (chain.transpose(0, 2, 1) @ hessian[used] @ chain).sum(axis=0)
+            g += np.einsum('wkc,wk->c', chain, gradient[used])
+        if Jacobian is not None and by_lane is not None:
+            for w in range(lanes.count):
+                first = lanes.first[w]
+                judged = slice(first + lanes.start[w], first + lanes.until[w])
+                Jacobian[judged] = by_lane[judged] @ chain[w]
+        return n
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """Windows of a record, as windows.c wants them; arrays of shape (WIDTH,).
+
+    Attributes:
+        count: How many of the lanes have a window.
+        first: First row of each: early enough for what a late sensor saw.
+        length: Rows of each.
+        start: Its first row that counts, from `first`.
+        until: The first that does not count any more.
+        handed: The first row of the next window.
+        late: Column of the delay of the inputs, or -1.
+        columns: Number of columns.
+    """
+
+    count: int
+    first: np.ndarray
+    length: np.ndarray
+    start: np.ndarray
+    until: np.ndarray
+    handed: np.ndarray
+    late: int
+    columns: int
+
+    @classmethod
+    def of(cls, time: np.ndarray, delay: float, nx: int, active: int, delay_column: int):
+        """Windows of equal length."""
+        n = len(time)
+        count = min(WIDTH, max(1, n - 1))
+        edges = np.linspace(0, n - 1, count + 1).astype(int)
+        first = np.searchsorted(time, time[edges[:-1]] - delay, side='right') - 1
+        first = np.minimum(np.maximum(first, 0), edges[:-1])
+        last = np.append(edges[1:-1], n - 1)
+        until = np.append(edges[1:-1], n)
+        handed = np.append(first[1:], n) - first
+
+        def padded(a, empty):
+            return np.array([*a, *[empty] * (WIDTH - count)], np.int32)
+
+        late = nx + active if delay_column >= 0 else -1
+        return cls(
+            count, padded(first, 0), padded(last - first + 1, 1), padded(edges[:-1] - first, 0),
+            padded(until - first, 0), padded(handed, -1), late, nx + active + (late >= 0),
+        )  # fmt: skip
+
+
+def symbols_of(e: Equations, free: tuple[str, ...]) -> ca.SX:
+    """Symbols of some of a model's parameters, shape (len(free), 1)."""
+    where = [e.parameter_names.index(name) for name in free]
+    return ca.vertcat(*(e.p[i] for i in where)) if where else ca.SX(0, 1)
+
+
+def states_source(e: Equations) -> str:
+    """C of the rollouts of a model.
+
+    Raises:
+        UnsupportedError: for an operation that has no vector form.
+    """
+    rates, shared_f = _vectorised(e, 'rates', 'prepare_rates', ca.densify(e.rates))
+    outputs, shared_h = _vectorised(e, 'seen', 'prepare_outputs', ca.densify(e.outputs))
+    given = {
+        'WIDTH': 2, 'NX': e.x.shape[0], 'NU': e.u.shape[0], 'NP': max(e.p.shape[0], 1),
+        'NY': e.outputs.shape[0], 'SHARED': shared_f + shared_h,
+        'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
+        'STATE_LIMIT': STATE_LIMIT, 'HALVINGS': HALVINGS, 'EASY': EASY,
+    }  # fmt: skip
+    # Inlined at each stage of a step the rates compile twice as long and run no faster.
+    rates = rates.replace('static inline __attribute__((always_inline))', 'static')
+    return _with_sizes(given, '\n'.join([
+        vector_math(), rates, outputs, _prepare(shared_f),
+        f'#define outputs(x, u, s, y) seen(x, u, s + {shared_f}, y)',
+        (HERE / 'rollout.c').read_text(),
+    ]))  # fmt: skip
+
+
+def _prepare(shared: int) -> str:
+    """C of `prepare`: what rates need of the parameters, then what outputs do."""
+    return (
+        'static void prepare(const vd *p, vd *s)\n'
+        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared}); }}'
+    )
+
+
+def windows_source(e: Equations, free: tuple[str, ...]) -> str:
+    """C of the sensitivities along a rollout.
+
+    Raises:
+        UnsupportedError: for an operation that has no vector form.
+    """
+    symbols = symbols_of(e, free)
+    A, B, P = (ca.jacobian(e.rates, by) for by in (e.x, e.u, symbols))
+    C, D = (ca.jacobian(e.outputs, by) for by in (e.x, symbols))
+    rates, shared_f = _vectorised(e, 'rates_by', 'prepare_rates', ca.densify(e.rates), A, B, P)
+    outputs, shared_h = _vectorised(e, 'outputs_by', 'prepare_outputs', C, D)
+    nx = e.x.shape[0]
+    given = {
+        'WIDTH': WIDTH, 'NX': nx, 'NU': e.u.shape[0], 'NP': max(e.p.shape[0], 1),
+        'NF': len(free), 'NY': e.outputs.shape[0], 'SHARED': shared_f + shared_h,
+        'HALVINGS': HALVINGS, 'STABLE': STABLE,
+    }  # fmt: skip
+    in_a, in_b = _places(A, nx), _places(B, nx + A.nnz())
+    in_p = _places(P, nx + A.nnz() + B.nnz())
+    in_c, in_d = _places(C, 0), _places(D, C.nnz())
+    decay = [f'o[{k}]' for i, j, k in in_a if i == j]
+    lines = [
+        vector_math(), rates, outputs,
+        '#define COLUMNS (NX + NF + 1)',
+        _prepare(shared_f),
+        'static vd variational(const vd *x, vd (*S)[COLUMNS], const vd *u, const vd *du,'
+        ' const vd *s, int nc, const int *place, int late, vd *dx, vd (*dS)[COLUMNS])',
+        '{',
+        f'    vd o[{nx + A.nnz() + B.nnz() + P.nnz() + 1}];',
+        '    rates_by(x, u, s, o);',
+        '    for (int i = 0; i < NX; i++) dx[i] = o[i];',
+        '    for (int c = 0; c < nc; c++) {',
+        *_product('dS', nx, in_a, 'o[{}] * S[{}][c]'),
+        '    }',
+        *(f'    if (place[{f}] >= 0) dS[{i}][place[{f}]] += o[{k}];' for i, f, k in in_p),
+        *(f'    if (late >= 0) dS[{i}][late] += o[{k}] * du[{v}];' for i, v, k in in_b),
+        f'    return -({" + ".join(decay) or "SPLAT(0.0)"});',
+        '}',
+        'static void output_sensitive(const vd *x, vd (*S)[COLUMNS], const vd *u, const vd *s,'
+        ' int nc, const int *place, vd (*C)[NX], vd (*J)[COLUMNS])',
+        '{',
+        f'    vd o[{C.nnz() + D.nnz() + 1}];',
+        f'    outputs_by(x, u, s + {shared_f}, o);',
+        '    for (int j = 0; j < NY; j++) for (int i = 0; i < NX; i++) C[j][i] = SPLAT(0.0);',
+        *(f'    C[{j}][{i}] = o[{k}];' for j, i, k in in_c),
+        '    for (int c = 0; c < nc; c++) {',
+        *_product('J', e.outputs.shape[0], in_c, 'o[{}] * S[{}][c]'),
+        '    }',
+        *(f'    if (place[{f}] >= 0) J[{j}][place[{f}]] += o[{k}];' for j, f, k in in_d),
+        '}',
+        (HERE / 'windows.c').read_text(),
+    ]  # fmt: skip
+    return _with_sizes(given, '\n'.join(lines))
+
+
+def _vectorised(e: Equations, name: str, prepare: str, *results: ca.SX) -> tuple[str, int]:
+    """C of what is not zero of some results, one after the other; and the size of `prepare`'s."""
+    stacked = ca.vertcat(*(ca.vec(r.nz[:]) for r in results if r.nnz()))
+    return vector_code(
+        ca.Function(name, [e.x, e.u, e.p], [ca.densify(ca.cse(stacked))]), name, prepare
+    )
+
+
+def _places(matrix: ca.SX, first: int) -> list[tuple[int, int, int]]:
+    """(row, column, place in a vector of values from `first` on) of what is not zero."""
+    rows, columns = matrix.sparsity().get_triplet()
+    return [(i, j, first + k) for k, (i, j) in enumerate(zip(rows, columns, strict=True))]
+
+
+def _product(target: str, rows: int, places: list[tuple[int, int, int]], term: str) -> list[str]:
+    """C lines of a sparse matrix times S."""
+    return [
+        f'        {target}[{i}][c] = '
+        f'{" + ".join(term.format(k, j) for a, j, k in places if a == i) or "SPLAT(0.0)"};'
+        for i in range(rows)
+    ]
+
+
+def _with_sizes(given: dict, source: str) -> str:
+    defines = '\n'.join(f'#define {name} {value}' for name, value in given.items())
+    return f'{defines}\n{source}'
+
+
+def _states_library(e: Equations) -> Path:
+    return shared_library(states_source(e), FLAGS)
+
+
+def _windows_library(e: Equations, free: tuple[str, ...]) -> Path:
+    return shared_library(windows_source(e, free), FLAGS)
+
+
+_NUMBER, _COUNT = ctypes.c_double, ctypes.c_int
+_ARRAY = np.ctypeslib.ndpointer(float, flags='C')
+_WHOLE = np.ctypeslib.ndpointer(np.int32, flags='C')
+
+
+def _optional(array):
+    class Optional(array):  # type: ignore[misc, valid-type]
+        @classmethod
+        def from_param(cls, value):
+            return None if value is None else super().from_param(value)
+
+    return Optional
+
+
+def _bind(library: Path) -> ctypes.CDLL:
+    loaded = ctypes.CDLL(str(library))
+    loaded.cgm_advance.argtypes = [_ARRAY, _ARRAY, _ARRAY, _NUMBER, _COUNT]
+    loaded.cgm_advance.restype = None
+    loaded.cgm_simulate.argtypes = [
+        _COUNT, _ARRAY, _NUMBER, _NUMBER, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _COUNT,
+        _optional(_WHOLE),
+    ]  # fmt: skip
+    loaded.cgm_outputs.argtypes = [_COUNT, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY]
+    loaded.cgm_outputs.restype = None
+    return loaded
+
+
+def _bind_windows(library: Path):
+    loaded = ctypes.CDLL(str(library))
+    loaded.cgw_normal.argtypes = [
+        *[_WHOLE] * 5, _ARRAY, _NUMBER, *[_ARRAY] * 3, _COUNT, _WHOLE, _COUNT, _ARRAY, _COUNT,
+        _WHOLE,
+        *[_ARRAY] * 3, _WHOLE, *[_ARRAY] * 3, _optional(_ARRAY),
+    ]  # fmt: skip
+    return loaded.cgw_normal

@@ -1,0 +1,1 @@
+"""Walking: impacts, contact, hybrid simulation, gaits."""

@@ -1,0 +1,1 @@
+"""What nodes share: the one table of topics, messages, settings, and the ROS helpers."""

@@ -1,0 +1,263 @@
+"""Channels: which field of which topic is which measured quantity (docs/interfaces.md).
+
+A channel is one scalar signal with a standard name. A topic feeds one or several channels; its
+extractor takes a message to the channels' values, and its composer goes the other way. Both
+work on any object that has the fields of the ROS message: those of `rosbags`, or of rclpy.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import atan2, cos, isfinite, sin, sqrt
+from typing import Any
+
+from cg_interfaces import topics
+
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+IMU = 'sensor_msgs/msg/Imu'
+STRING = 'std_msgs/msg/String'
+
+QUATERNION_NORM_TOLERANCE = 1e-2  # [1]; a drive that never filled the field sends norm 0
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One scalar signal.
+
+    Attributes:
+        name: Name of the channel, such as `hip_angle`.
+        unit: SI unit.
+        field: Field of the message: `position`, `velocity`, `effort` of a JointState,
+            `pitch` or `pitch_rate` of an Imu.
+        joint: Name of the joint inside a JointState; empty for an Imu.
+    """
+
+    name: str
+    unit: str
+    field: str
+    joint: str = ''
+
+    @property
+    def place(self) -> str:
+        """The field as a reader of the message would write it, such as `position[hip]`."""
+        return f'{self.field}[{self.joint}]' if self.joint else self.field
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a mechanism and the channels that it feeds.
+
+    Attributes:
+        name: Topic name.
+        msgtype: Message type, such as `sensor_msgs/msg/JointState`.
+        frame_id: Frame written into the header.
+        channels: Channels fed by the topic.
+        required: Whether a recording without this topic is useless.
+    """
+
+    name: str
+    msgtype: str
+    frame_id: str
+    channels: tuple[Channel, ...]
+    required: bool = False
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """The topics of one mechanism, inputs apart from outputs.
+
+    The torque command carries the same channels as the applied torque. It is the input only
+    where there is no applied torque, or on request.
+    """
+
+    name: str
+    torque: Topic
+    command: Topic
+    extra_inputs: tuple[Topic, ...]
+    outputs: tuple[Topic, ...]
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """Every topic by its name."""
+        every = (self.torque, self.command, *self.extra_inputs, *self.outputs)
+        return {topic.name: topic for topic in every}
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints of the torque messages, in model order."""
+        return tuple(channel.joint for channel in self.torque.channels)
+
+    @property
+    def measurement(self) -> str:
+        """The topic that completes a measurement, and that a controller answers."""
+        return self.outputs[0].name
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the torque channels, in model order."""
+        return tuple(channel.name for channel in self.torque.channels)
+
+    @property
+    def extra_input_names(self) -> tuple[str, ...]:
+        """Names of the inputs that are no torque, such as `drive_enabled`."""
+        return tuple(c.name for topic in self.extra_inputs for c in topic.channels)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of the measured channels, in model order."""
+        return tuple(c.name for topic in self.outputs for c in topic.channels)
+
+    def channel(self, name: str) -> Channel:
+        """The channel of that name.
+
+        Raises:
+            ValueError: This mechanism has no such channel.
+        """
+        for topic in self.topics.values():
+            for channel in topic.channels:
+                if channel.name == name:
+                    return channel
+        known = (*self.input_names, *self.extra_input_names, *self.output_names)
+        msg = f'{self.name} has no channel {name!r}; it has {", ".join(known)}'
+        raise ValueError(msg)
+
+
+def _torque_topics(frame_id: str, channels: tuple[Channel, ...]) -> tuple[Topic, Topic]:
+    """The applied torque and the torque command, which share their channels."""
+    return (
+        Topic(topics.APPLIED_TORQUE, JOINT_STATE, frame_id, channels, required=True),
+        Topic(topics.TORQUE_COMMAND, JOINT_STATE, frame_id, channels),
+    )
+
+
+def _drive_enabled(frame_id: str) -> Topic:
+    """The switch of the motor drive: 1 while it holds the motor's terminals, 0 while open."""
+    channel = Channel('drive_enabled', '1', 'position', 'enabled')
+    return Topic(topics.DRIVE_ENABLED, JOINT_STATE, frame_id, (channel,))
+
+
+def _define_mechanisms() -> dict[str, Mechanism]:
+    """The table of docs/interfaces.md."""
+    hip = (Channel('hip_torque', 'N m', 'effort', 'hip'),)
+    joint = (Channel('torque', 'N m', 'effort', 'joint'),)
+    two_joints = (
+        Channel('shoulder_torque', 'N m', 'effort', 'shoulder'),
+        Channel('elbow_torque', 'N m', 'effort', 'elbow'),
+    )
+    imu = (
+        Channel('imu_angle', 'rad', 'pitch'),
+        Channel('imu_rate', 'rad/s', 'pitch_rate'),
+    )
+    hip_angle = (Channel('hip_angle', 'rad', 'position', 'hip'),)
+    angle = (Channel('angle', 'rad', 'position', 'joint'),)
+    two_angles = (
+        Channel('shoulder_angle', 'rad', 'position', 'shoulder'),
+        Channel('elbow_angle', 'rad', 'position', 'elbow'),
+    )
+    mechanisms = (
+        Mechanism(
+            'compass_gait',
+            *_torque_topics('hip', hip),
+            (_drive_enabled('hip'),),
+            (
+                Topic(topics.IMU, IMU, 'imu_link', imu),
+                Topic(topics.HIP_ENCODER, JOINT_STATE, 'hip', hip_angle),
+            ),
+        ),
+        Mechanism(
+            'pendulum',
+            *_torque_topics('joint', joint),
+            (_drive_enabled('joint'),),
+            (Topic(topics.JOINT_STATES, JOINT_STATE, 'joint', angle),),
+        ),
+        Mechanism(
+            'double_pendulum',
+            *_torque_topics('base', two_joints),
+            (_drive_enabled('base'),),
+            (Topic(topics.JOINT_STATES, JOINT_STATE, 'base', two_angles),),
+        ),
+    )
+    return {mechanism.name: mechanism for mechanism in mechanisms}
+
+
+MECHANISMS = _define_mechanisms()
+
+
+def mechanism(name: str) -> Mechanism:
+    """The mechanism of that name.
+
+    Raises:
+        ValueError: No such mechanism; the message lists those there are.
+    """
+    if name not in MECHANISMS:
+        msg = f'unknown mechanism {name!r}; known are {", ".join(MECHANISMS)}'
+        raise ValueError(msg)
+    return MECHANISMS[name]
+
+
+def pitch_from_quaternion(x: float, y: float, z: float, w: float) -> float:
+    """Pitch about +y of a body that does not roll, whatever its heading.
+
+    Gravity seen from the body is (-sin(pitch), 0, cos(pitch)), so that heading drops out and
+    the full circle is resolved.
+
+    Returns:
+        Pitch in rad, in (-pi, pi].
+    """
+    return atan2(2.0 * (w * y - x * z), 1.0 - 2.0 * (x * x + y * y))
+
+
+def extract(message: Any, topic: Topic) -> dict[str, float]:
+    """Values of a topic's channels in one message.
+
+    A value that the message declares absent (covariance[0] = -1 in an Imu, a joint that is not
+    listed, a field of the JointState left empty) is left out of the answer.
+
+    Returns:
+        Channel name -> value in the channel's unit. May hold NaN where the message does.
+
+    Raises:
+        ValueError: The message contradicts itself (an orientation that is no unit quaternion,
+            fewer values than joint names).
+    """
+    return EXTRACTORS[topic.msgtype](message, topic)
+
+
+def _extract_joint_state(message: Any, topic: Topic) -> dict[str, float]:
+    names = list(message.name)
+    values = {}
+    for channel in topic.channels:
+        field = getattr(message, channel.field)
+        if channel.joint not in names or len(field) == 0:
+            continue
+        index = names.index(channel.joint)
+        if index >= len(field):
+            msg = f'{channel.field} holds {len(field)} values for {len(names)} joint names'
+            raise ValueError(msg)
+        values[channel.name] = float(field[index])
+    return values
+
+
+def _extract_imu(message: Any, topic: Topic) -> dict[str, float]:
+    values = {}
+    for channel in topic.channels:
+        if channel.field == 'pitch' and message.orientation_covariance[0] != -1.0:
+            q = message.orientation
+            norm = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+            if isfinite(norm) and abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+                msg = f'orientation has norm {norm:.3g}; a unit quaternion is needed'
+                raise ValueError(msg)
+            values[channel.name] = pitch_from_quaternion(q.x, q.y, q.z, q.w)
+        if channel.field == 'pitch_rate' and message.angular_velocity_covariance[0] != -1.0:
+            values[channel.name] = float(message.angular_velocity.y)
+    return values
+
+
+EXTRACTORS: dict[str, Callable[[Any, Topic], dict[str, float]]] = {
+    JOINT_STATE: _extract_joint_state,
+    IMU: _extract_imu,
+}
+
+
+def quaternion_from_pitch(pitch: float) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w) of a rotation by `pitch`, in rad, about +y."""
+    return 0.0, sin(pitch / 2.0), 0.0, cos(pitch / 2.0)

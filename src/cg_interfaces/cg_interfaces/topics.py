@@ -1,0 +1,16 @@
+"""Names of topics, said once: docs/interfaces.md, "Topics". What flows on them: channels.py."""
+
+IMU = '/imu'
+HIP_ENCODER = '/hip_encoder'
+HIP_COUNTS = '/hip_encoder/counts'
+JOINT_STATES = '/joint_states'
+TORQUE_COMMAND = '/torque_command'
+TORQUE_REQUEST = '/torque_request'
+APPLIED_TORQUE = '/applied_torque'
+DRIVE_ENABLED = '/drive_enabled'
+FOOT_CONTACT = '/foot_contact/{leg}'
+STATE = '/state'
+EXPERIMENT = '/experiment'
+RECORDER_PROGRESS = '/recorder/progress'
+CLOCK = '/clock'
+DIAGNOSTICS = '/diagnostics'

@@ -1,0 +1,31 @@
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'cg_interfaces'
+
+
+def shared(*folders):
+    """The files below these folders, each to its place under share/cg_interfaces."""
+    files = [p for folder in folders for p in sorted(glob(f'{folder}/**', recursive=True))]
+    return [(f'share/{NAME}/{Path(p).parent}', [p]) for p in files if Path(p).is_file()]
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Topics, messages, settings and ROS helpers of the compass-gait robot',
+    maintainer='Compass-gait maintainers',
+    maintainer_email='maintainers@compass-gait.dev',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test', 'test.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+    ],
+    python_requires='>=3.10',
+    install_requires=['cg_description', 'cg_dynamics', 'numpy', 'PyYAML'],
+    extras_require={'test': ['pytest', 'pytest-timeout']},
+    zip_safe=False,
+)

@@ -1,0 +1,1 @@
+"""Is a recording sound? Checked before anything is fitted."""

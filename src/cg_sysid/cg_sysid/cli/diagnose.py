@@ -1,0 +1,326 @@
+"""Command line: what does my simulation get wrong about these recordings, and why?
+
+    cg diagnose --model MODEL --out DIR BAG [BAG ...]
+
+Writes DIR/diagnosis.json, DIR/report.html, DIR/curves.npz and, where records could be used,
+DIR/model.yaml: the model with the causes in it. What no cause explains is in DIR/learned.yaml: the
+same model with a learned term.
+
+An answer comes within the budget. Until the search is done, DIR/fits holds where its fits came to:
+the same command with more time goes on from there.
+"""
+
+import argparse
+import fnmatch
+import math
+import shutil
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from cg_description.paths import model_path
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.model import Model
+from cg_sysid.checks.faults import FaultSignal
+from cg_sysid.checks.loading import Intake, take_in
+from cg_sysid.cli import common as cli
+from cg_sysid.cluster import Cluster
+from cg_sysid.deadline import Deadline
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Diagnosis, Options
+from cg_sysid.experiments.catalogue import experiments_for
+from cg_sysid.progress import Bars
+from cg_sysid.provenance import provenance
+from cg_sysid.records.record import Record
+from cg_sysid.report import curves, write_report
+from cg_sysid.report.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
+
+MODEL = 'model.yaml'
+LEARNED = 'learned.yaml'
+FITS = 'fits'
+BUDGET = 120.0  # s
+COLOURS = {
+    'consistent': 'green', 'explained': 'green', 'ambiguous': 'yellow', 'unexplained': 'magenta',
+    'unfinished': 'magenta', 'unusable': 'red',
+}  # fmt: skip
+EPILOG = """\
+verdicts:
+  consistent    the model explains the recordings down to the noise of the sensors
+  explained     named causes are missing from the model
+  ambiguous     causes that these recordings cannot tell apart
+  unexplained   something is missing that no effect of the library explains
+  unfinished    the search was broken off before it found what explains most of the error
+  unusable      the recordings themselves are broken (exit code 1)
+
+Ctrl-C ends the search with the best answer so far, as the end of the budget does. The same
+command with a larger --budget goes on from there.
+
+exit code 0 with an answer, 1 if the recordings are unusable, 2 for a wrong argument
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = argparse.ArgumentParser(
+        prog='cg diagnose',
+        description='Say what a simulation gets wrong about recordings, name the cause, and '
+        'show how much better the model is with that cause in it.',
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    cli.common_options(made)
+    made.add_argument(
+        '--effects', metavar='A,B', help='try only these effects [the whole library]'
+    )
+    made.add_argument(
+        '--rounds', type=int, default=Options.rounds, help='most effects to add [%(default)s]'
+    )
+    made.add_argument(
+        '--budget', type=float, default=BUDGET, metavar='SECONDS',
+        help='end the search after this time with the best answer so far; inf for no limit '
+        '[%(default)g]',
+    )  # fmt: skip
+    made.add_argument('--workers', type=int, help='local processes [one per core]')
+    made.add_argument(
+        '--scheduler', metavar='ADDRESS',
+        help='fit on the workers of this dask scheduler instead, such as tcp://127.0.0.1:8786',
+    )  # fmt: skip
+    made.add_argument(
+        '--held', '--hold-out', metavar='GLOB',
+        help="records to judge on, by name, such as 'spring*_2' [every second recording of a "
+        'set-up]',
+    )  # fmt: skip
+    return made
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run('cg diagnose', work, parser().parse_args(args))
+
+
+def work(options: argparse.Namespace) -> int:
+    """Read, check, diagnose, write."""
+    if options.rounds < 1:
+        raise ValueError(f'--rounds is {options.rounds}; at least 1 is needed')
+    if not options.budget > 0:
+        raise ValueError(
+            f'--budget is {options.budget:g}; it must be positive (s), inf is allowed'
+        )
+    deadline = Deadline(options.budget)
+    if options.workers is not None and options.workers < 0:
+        raise ValueError(f'--workers is {options.workers}; it must not be negative')
+    if options.scheduler is not None and options.workers is not None:
+        raise ValueError('--workers are local processes; leave it out where --scheduler is given')
+    if options.out.is_file():
+        raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
+    model_file = model_path(options.model)
+    model = Model.load(model_file)
+    effects = _effects(options.effects, model)
+    note = cli.load_note(options.note)
+    fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
+    with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
+        intake = take_in(
+            options.bags, model_file, note, options.torque, options.window, bars,
+            options.use_anyway,
+        )
+        _same_mechanism(model, intake.records)
+        origin = provenance(
+            model_file,
+            ['cg', 'diagnose', *_command(options)],
+            {
+                'effects': options.effects or 'all', 'rounds': options.rounds,
+                'budget_s': options.budget if math.isfinite(options.budget) else None,
+                'window_s': options.window, 'held': options.held or 'automatic',
+                'input': options.torque or 'automatic', 'note': options.note,
+            },
+            options.date,
+        )  # fmt: skip
+        if _too_few(intake):
+            facts, lines = unusable_facts(model, intake, _why(intake), origin), []
+            answer = None
+        else:
+            with deadline.interruptible('cg diagnose'):
+                answer = diagnose(
+                    model, intake.records, _options(options, effects, intake, model), bars,
+                    executor, intake.landings, deadline,
+                )
+            lines = diagnosis_curves(answer)
+            facts = diagnosis_facts(answer, intake, origin, lines)
+        options.out.mkdir(parents=True, exist_ok=True)
+        bars('writing the report', 0, 1)
+        faults = [signal for source in intake.sources for signal in source.signals]
+        write_results(options.out, facts, lines, faults, answer)
+        bars('writing the report', 1, 1)
+    if answer is not None and answer.unfinished is None:
+        shutil.rmtree(options.out / FITS, ignore_errors=True)
+    cli.print_left_out(facts)
+    cli.print_steps(Console(), intake.steps, intake.phases)
+    cli.print_windows(Console(), facts)
+    show(Console(), facts, options.out, options.quiet)
+    return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
+
+
+def _command(options: argparse.Namespace) -> list[str]:
+    words = ['--model', options.model, '--out', str(options.out)]
+    for name, value in (
+        ('--effects', options.effects), ('--held', options.held), ('--window', options.window),
+        ('--note', options.note), ('--input', options.torque), ('--workers', options.workers),
+        ('--scheduler', options.scheduler),
+    ):  # fmt: skip
+        words += [] if value is None else [name, str(value)]
+    for finding in options.use_anyway:
+        words += ['--use-anyway', finding]
+    if options.rounds != Options.rounds:
+        words += ['--rounds', str(options.rounds)]
+    if options.budget != BUDGET:
+        words += ['--budget', f'{options.budget:g}']
+    return [*words, *options.bags]
+
+
+def _same_mechanism(model: Model, records: Sequence[Record]) -> None:
+    for record in records:
+        if record.mechanism != model.mechanism.name:
+            raise ValueError(
+                f'{record.source}: recorded on a {record.mechanism}, but the model '
+                f'{model.name!r} is of a {model.mechanism.name}'
+            )
+
+
+def _too_few(intake: Intake) -> bool:
+    # One good record alone is not enough either, but then it is not the recordings' fault.
+    return not intake.records or (len(intake.records) == 1 and bool(intake.left_out))
+
+
+def _why(intake: Intake) -> str:
+    total, bad = len(intake.sources), len(intake.left_out)
+    if bad == total:
+        which = 'The recording is' if total == 1 else f'All {total} recordings are'
+    else:
+        which = f'{bad} of {total} recordings {"is" if bad == 1 else "are"}'
+    first = intake.left_out[0]
+    return f'{which} broken, and nothing was fitted. {first.name}: {first.reason}.'
+
+
+def _effects(text: str | None, model: Model) -> tuple[str, ...] | None:
+    """The effects that were asked for; None for the whole library."""
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    body = model.mechanism
+    known = {effect(body, at).label for effect in LIBRARY.values() for at in effect.sites(body)}
+    known |= set(LIBRARY)
+    for name in names or ('',):
+        if name not in known:
+            raise ValueError(
+                f'--effects: no effect {name!r}; the library has: {", ".join(sorted(LIBRARY))}'
+            )
+    return names
+
+
+def _options(
+    options: argparse.Namespace, effects: tuple[str, ...] | None, intake: Intake, model: Model
+) -> Options:
+    held = None
+    if options.held:
+        names = [record.name for record in intake.records]
+        held = tuple(
+            n for n in names
+            if any(fnmatch.fnmatchcase(x, options.held) for x in (n, intake.origin[n]))
+        )  # fmt: skip
+        if not held or len(held) == len(names):
+            raise ValueError(
+                f'--held {options.held!r} matches {"no" if not held else "every"} record; '
+                f'there are: {", ".join(names)}'
+            )
+    return Options(
+        effects=effects, rounds=options.rounds, workers=options.workers, held=held,
+        experiments=tuple(experiments_for(model)), kept=options.out / FITS,
+        wholes=intake.wholes,
+    )  # fmt: skip
+
+
+def diagnosis_curves(answer: Diagnosis) -> list[curves.Curve]:
+    """Measured and simulated signals of every record, those held out first."""
+    before, after = answer.baseline, answer.extended
+    found = []
+    for role, trials, a, b in (
+        ('held', answer.held, before.held, after.held),
+        ('train', answer.train, before.train, after.train),
+    ):
+        for k, trial in enumerate(trials):
+            found.append(
+                curves.make_curve(
+                    trial, role, before.model, a.motions[k], after.model, b.motions[k]
+                )
+            )
+    return found
+
+
+def write_results(
+    directory: Path,
+    facts: Facts,
+    lines: list[curves.Curve],
+    faults: list[FaultSignal],
+    answer: Diagnosis | None,
+) -> None:
+    """Everything that a diagnosis leaves behind."""
+    write_facts(facts, directory)
+    curves.save(lines, directory, faults)
+    models = {} if answer is None else {MODEL: extended_model(answer, facts)}
+    if answer is not None and answer.unmodelled is not None:
+        learned = answer.unmodelled.fit.model
+        models[LEARNED] = replace(learned, provenance=models[MODEL].provenance)
+    for name in (MODEL, LEARNED):
+        if name in models:
+            models[name].save(directory / name)
+        else:
+            (directory / name).unlink(missing_ok=True)
+    write_report(directory)
+
+
+def extended_model(answer: Diagnosis, facts: Facts) -> Model:
+    """The model with the causes in it; its provenance says where it comes from."""
+    origin = facts['provenance']
+    return replace(
+        answer.extended.train.model,
+        provenance={
+            'made_by': 'diagnose',
+            'created': origin['created'],
+            'parent': Path(origin['model_file']).name,
+            'parent_sha256': origin['model_sha256'],
+            'verdict': answer.verdict,
+            'causes': [cause.label for cause in answer.causes],
+            'records': [
+                {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']
+            ],
+            'parent_provenance': dict(answer.nominal.provenance),
+        },
+    )
+
+
+def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:
+    """Print the answer for people."""
+    verdict = facts['verdict']
+    so_far = ' so far' if facts['unfinished'] and verdict != 'unfinished' else ''
+    console.print(
+        f'[bold {COLOURS[verdict]}]{verdict}{so_far}[/]  {facts["summary"]}', highlight=False
+    )
+    if not quiet:
+        cli.print_causes(console, facts)
+        cli.print_gain(console, facts)
+        cli.print_leftover(console, facts)
+        cli.print_findings(console, facts['findings'])
+    if facts['unfinished']:
+        console.print(
+            '  [yellow]note[/] the same command with a larger --budget goes on from here'
+        )
+    cli.print_next(console, facts)
+    console.print(f'report: {directory / "report.html"}', highlight=False, soft_wrap=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

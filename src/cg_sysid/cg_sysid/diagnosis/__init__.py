@@ -1,0 +1,1 @@
+"""The diagnosis: the loop over causes, its result, and the next experiment."""

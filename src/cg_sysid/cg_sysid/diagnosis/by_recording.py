@@ -1,0 +1,136 @@
+"""Which number differs from recording to recording?
+
+A joint greased in between, a supply that sags, a robot set down on another floor: within a
+recording a number stands still, from one to the next it does not. No effect of the library says
+so, and no function of one variable. So one number after the other gets a value of each recording's
+own, with all else identified anew: that which takes most of the error away is where to look.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_sysid.diagnosis.between_recordings import Wandering
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.identify import Fit, fit
+from cg_sysid.identification.unknowns import IdentificationError, own_unknowns
+from cg_sysid.search.candidates import Outcome, candidates_for, started_from
+from cg_sysid.search.model_selection import AT_NOISE
+from cg_sysid.search.nuisance import turning
+
+FEWEST = 3  # recordings: two always differ
+MOST = 30  # recordings; of more, as the steps of a walk, none is a session
+EXPLAINS = 0.7  # share of the error above the noise that a number must take away
+CLEARLY = 0.5  # of what the next best number leaves, that the best may leave
+ITERATIONS = 24
+
+Run = Callable[[Callable, list[tuple], str], list]
+
+
+def what_wanders(
+    o: Outcome, trials: Sequence[Trial], names: Sequence[str] | None, run: Run
+) -> Wandering | None:
+    """The number that explains most if every recording has its own; None if none does much.
+
+    Args:
+        o: The model as far as it is known, fitted.
+        trials: Those that it was fitted to, then those held out.
+        names: Effects that may be tried; None for the whole library.
+        run: Calls a function with each tuple of arguments, in parallel perhaps, and tells people
+            what for.
+    """
+    recordings = list(dict.fromkeys(trial.recording for trial in trials))
+    if not FEWEST <= len(recordings) <= MOST:
+        return None
+    start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    numbers = list(numbers_of(o.train.model, trials, names))
+    base = run(_fit_with_own, [(o, '', None, trials, start, np.inf)], 'all recordings as one')[0]
+    if isinstance(base, str) or base.normalised_error < AT_NOISE:
+        return None
+    # Who leaves more is neither named nor in the way of another.
+    reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
+    arguments = [(o, *number, trials, start, reach) for number in numbers]
+    found = run(_fit_with_own, arguments, 'recording by recording')
+    fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
+    if not fits:
+        return None
+    best, *others = fits
+    explained = 1 - _above_noise(best) / _above_noise(base)
+    left = min(map(_above_noise, others), default=np.inf)
+    if not explained > EXPLAINS or _above_noise(best) > CLEARLY * left:
+        return None
+    return _wandering(best, o.model, trials, explained)
+
+
+def _above_noise(found: Fit) -> float:
+    return float(found.squares - found.count.sum())
+
+
+def _wandering(found: Fit, model: Model, trials: Sequence[Trial], explained: float) -> Wandering:
+    known = {u.name for u in own_unknowns(model)}
+    (place,) = (k for k, u in enumerate(found.own) if u.name not in known)
+    number, first = found.own[place], len(found.own) - place
+    values = {}
+    for trial, motion, sigmas in zip(trials, found.motions, found.own_sigmas, strict=True):
+        values[trial.recording] = float(motion[len(motion) - first]), float(sigmas[place])
+    called = {recording: Path(recording).name for recording in values}
+    if len(set(called.values())) < len(called):
+        called = {recording: recording for recording in values}
+    return Wandering(
+        number.name, number.unit, {called[r]: values[r] for r in sorted(values)}, explained
+    )
+
+
+def numbers_of(
+    model: Model, trials: Sequence[Trial], names: Sequence[str] | None
+) -> Iterator[tuple[str, str | None]]:
+    """(Effect, place) of those that have one number, their size; of the model or not."""
+    stated = [(effect.name, effect.at) for effect in model.effects]
+    lacking = candidates_for(model, [trial.setup for trial in trials], names)
+    for name, at in (*stated, *lacking):
+        if name not in LIBRARY:
+            continue
+        kind = LIBRARY[name]
+        own = any(p.each for p in kind.parameters)
+        plain = not (own or kind.states or kind.extra_inputs) and kind.parameters[0].neutral == 0.0
+        if plain and sum(p.free for p in kind.parameters) == 1:
+            yield name, at
+
+
+def _fit_with_own(
+    o: Outcome, name: str, at: str | None, trials: Sequence[Trial], start: Fit, reach: float
+) -> Fit | str:
+    """A fit to all records where every recording has its own size of the effect that is named."""
+    model = with_own(o.model, name, at, o.train.model) if name else o.model
+    bounds = o.task.bounds
+    try:
+        found = fit(
+            model, trials, start=started_from(start, model, bounds), own=o.events, bounds=bounds,
+            iterations=ITERATIONS, reach=reach,
+        )  # fmt: skip
+        return replace(found, model=o.model)  # a class made here does not leave this process
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+
+
+def with_own(model: Model, name: str, at: str | None, fitted: Model) -> Model:
+    """The model in which every recording has its own size of an effect.
+
+    The effect is added if the model lacks it. The size that stands for recordings which nobody
+    has seen is that of `fitted`.
+    """
+    kind = LIBRARY[name]
+    label, (size, *others) = kind(model.mechanism, at).label, kind.parameters
+    if all(effect.label != label for effect in model.effects):
+        model = model.with_effect(name, at, **{size.name: size.scale}, **turning(model, name, at))
+    else:
+        model = model.with_values({f'{label}.{size.name}': fitted.values[f'{label}.{size.name}']})
+    own = (replace(size, each='recording'), *others)
+    marked = type(kind.__name__, (kind,), {'parameters': own})
+    effects = (e if e.label != label else marked(model.mechanism, at) for e in model.effects)
+    return replace(model, effects=tuple(effects))

@@ -1,0 +1,186 @@
+"""The answer of a diagnosis in a few sentences."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_sysid.diagnosis.between_recordings import Wandering
+from cg_sysid.diagnosis.result import Cause
+from cg_sysid.identification.gain import NO_GAIN, Gain
+from cg_sysid.learned.unmodelled import NOTHING, Unmodelled
+from cg_sysid.search.ranking import MARGIN, effect_name
+from cg_sysid.text import listed, measured, number
+
+INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
+MOST_TOLD = 3  # events of single records in the summary
+CERTAIN = 30.0  # nats: odds of 1e13 to 1, beyond what a noise floor a little off could feign
+
+
+def summary_of(
+    verdict: str,
+    causes: Sequence[Cause],
+    gains: Sequence[Gain],
+    left: dict[str, float],
+    strained: Sequence[str] = (),
+    unmodelled: Unmodelled | None = None,
+    tried: Sequence[str] | None = None,
+    wandering: Wandering | None = None,
+    explained: float = 1.0,
+    late: str = '',
+) -> str:
+    """The answer in a few sentences.
+
+    Args:
+        verdict: The verdict.
+        causes: Named causes.
+        gains: Errors before and after.
+        left: Outputs with an error above the noise.
+        strained: Numbers that the file does not believe.
+        unmodelled: What is left, as a learned term.
+        tried: Effects that were tried; None for the whole library.
+        wandering: A number that differs from recording to recording.
+        explained: Share of the squared error above the noise that the causes take.
+        late: What errors of timing make of an error that stays unexplained, as a sentence.
+    """
+    if verdict == 'consistent':
+        text = 'The model explains the records down to the noise of the sensors'
+        if max(g.before / g.after for g in gains) > NO_GAIN:
+            text += (
+                ', with what sound robots have besides: small faults and laws of another shape, '
+                'which the findings list and model.yaml holds'
+            )
+        if strained:
+            text += f', but with {", ".join(strained)} far from what its file believes'
+        return f'{text}.'
+    biggest = max(gains, key=lambda g: g.before / g.noise)
+    if verdict == 'unexplained':
+        known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
+        whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
+        text = (
+            f'Something is missing that no effect {whose} explains: {biggest.channel} is '
+            f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
+            f'{biggest.noise:.2g}. {known or NOTHING}'
+        )
+        if causes:
+            text += (
+                f' No more than {100 * explained:.0f} % of the squared error on held-out records '
+                f'goes with {listed([described(c) for c in causes])}, which may only stand in '
+                'for what is missing.'
+            )
+        return f'{text} {late}' if late else text
+    named = ', '.join(described(c) for c in causes)
+    if verdict == 'unfinished':
+        text = (
+            f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
+            f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '
+            'found so far.'
+        )
+        return f'{text} {named} takes {100 * explained:.0f} % of it.' if causes else text
+    if biggest.before < NO_GAIN * biggest.after and strained:
+        text = (
+            f'The simulation lacks {named}: without it the model follows the records only with '
+            f'{", ".join(strained)} far from what its file believes.'
+        )
+    else:
+        text = (
+            f'The simulation lacks {named}, {_sureness(causes)}; with it the held-out error of '
+            f'{biggest.channel} falls from {biggest.before:.3g} to {biggest.after:.3g} '
+            f'{biggest.unit} (noise {biggest.noise:.2g}).'
+        )
+    vague = [f'{c.label}.{name}' for c in causes for name in c.undetermined]
+    if vague:
+        text += (
+            f' These records do not determine {" and ".join(vague)}: what acts like this need '
+            'not be what it is named after.'
+        )
+    best = next((c.proposals[0] for c in causes if c.proposals), None)
+    if best is not None and best.evidence > MARGIN:
+        text += (
+            f' To tell {" from ".join(best.weakest)}, run {best.experiment} '
+            f'(about {best.evidence:.0f} nats expected).'
+        )
+    elif best is not None:
+        text += (
+            f' No experiment that can be launched would tell {" from ".join(best.weakest)}: for '
+            'what these recordings show they are one.'
+        )
+    if left:
+        text += f' An error above the noise remains in {", ".join(left)}.'
+        text += f' {unmodelled.text}' if unmodelled else ''
+        text += f' {wandering.text}' if wandering else ''
+    return text
+
+
+def described(cause: Cause) -> str:
+    """A cause with its numbers and rivals, in words."""
+    own = _of_single_records(cause)
+    shared = [name for name in cause.parameters if not own or name not in own]
+    numbers = ', '.join(f'{name} {_told(cause, name)}' for name in shared)
+    happened = _happened(cause, own) if own else []
+    inside = '; '.join(part for part in (*happened, numbers) if part)
+    rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
+    replaced = f', which replaces {listed(list(cause.replaces))}' if cause.replaces else ''
+    return f'{cause.label} ({inside}){rivals}{replaced}'
+
+
+def _of_single_records(cause: Cause) -> tuple[str, ...]:
+    """Names of what happened in single records, as a push; none where nothing surely did."""
+    kind = LIBRARY.get(effect_name(cause.label))
+    if kind is None or not cause.events:
+        return ()
+    return tuple(p.name for p in kind.parameters if p.each == 'record')
+
+
+def _happened(cause: Cause, names: Sequence[str]) -> list[str]:
+    """Each event with its record, the largest first; how many more there are."""
+    ordered = sorted(cause.events, key=lambda record: -abs(cause.events[record][names[0]][0]))
+    told = [
+        f'in {record} ' + ', '.join(
+            f'{name} = {measured(*cause.events[record][name])}' for name in names
+        )
+        for record in ordered[:MOST_TOLD]
+    ]
+    more = len(ordered) - len(told)
+    return [*told, *([f'and {more} more'] if more else [])]
+
+
+def _sureness(causes: Sequence[Cause]) -> str:
+    """How sure the least sure of the causes is, in words and in nats."""
+    least = min(cause.evidence for cause in causes)
+    if not np.isfinite(least):
+        return 'very likely, as the model without it does not follow the records at all'
+    sure = 'very likely' if least >= CERTAIN else 'likely'
+    either = 'one or the other ' if any(cause.rivals for cause in causes) else ''
+    return f'{either}{sure} ({number(least)} nats of evidence)'
+
+
+def _told(cause: Cause, name: str) -> str:
+    """The value of a parameter, or what it ranges over where records have their own."""
+    value, sigma, unit = cause.parameters[name]
+    if not is_determined(cause.label, name, sigma):
+        return 'not determined'
+    own = {row[name][0] for row in cause.events.values() if name in row}
+    if len(own) > 1:
+        tail = '' if unit == '1' else f' {unit}'
+        return f'from {number(min(own))} to {number(max(own))}{tail}'
+    return f'= {measured(value, sigma, unit)}'
+
+
+def is_determined(label: str, name: str, sigma: float) -> bool:
+    """Whether the 95 % interval of a place on a body tells where it is.
+
+    It does if it is no wider than what lies between two of the places from which it is sought.
+
+    Args:
+        label: Of the effect.
+        name: Of its parameter; all that are no places, sizes among them, count as determined.
+        sigma: Standard deviation in its unit.
+    """
+    kind = LIBRARY.get(effect_name(label))
+    declared = {p.name: p for p in kind.parameters}.get(name) if kind else None
+    if declared is None or declared.neutral is not None or declared.logarithmic:
+        return True
+    if declared.unit != 'm' or len(declared.starts) < 2:
+        return True
+    return 2 * INTERVAL * sigma <= float(np.diff(sorted(declared.starts)).min())

@@ -1,0 +1,1 @@
+"""Experiments: excitation, the catalogue, rehearsal in simulation, fault injection."""

@@ -1,0 +1,1 @@
+"""Identification by simulation error: unknowns, data sets, fits, uncertainty."""

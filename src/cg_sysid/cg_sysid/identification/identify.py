@@ -1,0 +1,665 @@
+"""Identification by simulation error over many records at once: theory.md, (ID).
+
+    J = sum_records sum_k |y_sim[k] - y_measured[k]|^2_W  +  |theta - theta_file|^2_(1/tolerance^2)
+
+over the parameters shared by all records and, for each record, its own initial motion. Gauss-
+Newton with exact sensitivities and Levenberg-Marquardt damping; each record's own unknowns are
+eliminated by a Schur complement, so that many records cost no more than their simulation.
+
+Two things make it robust. The horizon grows from a fraction of a second to the whole record, so
+that the cliffs of the full cost (thesis, 4.2.3) are met only near the solution. And the weight
+W follows the residual that is left, so that a wrong model does not buy a small gain in fit with
+parameters far outside what the model file believes.
+"""
+
+import time as clock
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cg_dynamics.assemble import acting_effects, parameter_vector
+from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.deadline import check_time
+from cg_sysid.identification import kept_fits
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.information_criterion import weight_of
+from cg_sysid.identification.simulation_error import (
+    BARRIER,
+    Point,
+    Problem,
+    evaluate,
+    moved,
+    own_values,
+    reduced,
+)
+from cg_sysid.identification.uncertainty import not_asked, uncertainty
+from cg_sysid.identification.unknowns import (
+    IdentificationError,
+    Unknown,
+    own_unknowns,
+    unknowns_of,
+    unsettled_states,
+)
+from cg_sysid.text import off_by
+
+HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
+BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
+BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
+STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
+SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
+CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
+DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
+BACK = 5  # of these at most
+ACROSS = 1e-3  # damping of that: flat directions stay where they are
+ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
+HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
+REFINED = 2.0  # integration steps of a thorough fit in place of one
+PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
+HOPE = 10.0  # times that gain, within which it may still come there
+WHOLE = 'fitting whole records, in rounds until it settles'
+ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
+Progress = Callable[[str, int, int, str], None]
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where a minimisation came to; without a point where the simulation runs away."""
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    point: Point | None
+    converged: bool
+    hopeless: bool = False
+
+
+def _so_far(found: _Descent) -> str:
+    """How good a descent is, in words."""
+    if found.point is None:
+        return ''
+    return off_by(float(found.point.sse.sum() / max(found.point.count.sum(), 1)))
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a fit came to, before anybody asks how sure that is; as numbers it can be kept.
+
+    Attributes:
+        theta: Coordinates of the unknowns, shape (k,).
+        motions: What each trial has of its own.
+        cost: Final cost.
+        sse: Squared error over noise variance of each trial and output, shape (trials, ny).
+        count: Samples behind it.
+        weight: Of the residual in the cost.
+        converged: Whether it is a minimum.
+    """
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    cost: float
+    sse: np.ndarray
+    count: np.ndarray
+    weight: float
+    converged: bool
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it as lists."""
+        return {
+            'theta': self.theta.tolist(), 'motions': [m.tolist() for m in self.motions],
+            'cost': self.cost, 'sse': self.sse.tolist(), 'count': self.count.tolist(),
+            'weight': self.weight, 'converged': self.converged,
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, numbers: Mapping[str, Any] | None) -> '_End | None':
+        """What `numbers` wrote; None of nothing, or of something else."""
+        try:
+            return None if numbers is None else cls(
+                np.array(numbers['theta'], float),
+                [np.array(m, float) for m in numbers['motions']],
+                float(numbers['cost']), np.array(numbers['sse'], float),
+                np.array(numbers['count'], float), float(numbers['weight']),
+                bool(numbers['converged']),
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError):
+            return None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of an identification.
+
+    Attributes:
+        model: The model with the identified values and their standard deviations.
+        unknowns: What was identified.
+        values: Identified value of each unknown.
+        covariance: Of the unknowns' coordinates (log where logarithmic), shape (k, k).
+        information: Share of each unknown's certainty that comes from data, 0 (all from the
+            model file's belief) to 1.
+        motions: What each trial has of its own: initial motion, (2m,), how far extra states are
+            from settled at its start (`unsettled_states`, in their spreads), then one value for
+            each of `own`.
+        own: Parameters of which every record has a value of its own (a push's instant).
+        own_sigmas: Standard deviation of these, shape (len(own),) for each trial.
+        cost: Final cost J, in squared noise standard deviations.
+        mse: Mean squared error of each trial and output, in squared noise, shape (trials, ny).
+        count: Samples behind `mse`.
+        inflation: Variance of the residual over that of the noise, as used in the weights.
+        horizon: Length of the records used, in s.
+        evaluations: Number of evaluations of all records.
+        seconds: Wall time.
+        refinement: Integration steps that were taken in place of one.
+        converged: False if it stopped at the limit of iterations.
+        warnings: What a person should know: bounds, correlations, unidentifiable directions.
+        starts: What the starts of extra states cost as evidence, in the unit of `belief`.
+    """
+
+    model: Model
+    unknowns: tuple[Unknown, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    information: np.ndarray
+    motions: tuple[np.ndarray, ...]
+    own: tuple[Unknown, ...]
+    own_sigmas: tuple[np.ndarray, ...]
+    cost: float
+    mse: np.ndarray
+    count: np.ndarray
+    inflation: float
+    horizon: float
+    evaluations: int
+    seconds: float
+    refinement: float
+    converged: bool
+    warnings: tuple[str, ...] = ()
+    starts: float = 0.0
+
+    @property
+    def sigmas(self) -> np.ndarray:
+        """Standard deviation of each value, in its unit, shape (k,)."""
+        spread = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+        pairs = zip(self.unknowns, self.values, strict=True)
+        factor = [v if u.logarithmic else 1.0 for u, v in pairs]
+        return spread * np.array(factor)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Positive numbers without a belief of which not even the order is known."""
+        relative = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+        return tuple(
+            u.name for u, spread in zip(self.unknowns, relative, strict=True)
+            if u.logarithmic and not np.isfinite(u.tolerance) and spread > ORDER
+        )
+
+    def own_by_name(self, trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
+        """What was found of each trial alone: its name -> full name -> value."""
+        count = len(self.own)
+        return {
+            trial.name: {
+                u.name: float(v)
+                for u, v in zip(self.own, motion[len(motion) - count :], strict=True)
+            }
+            for trial, motion in zip(trials, self.motions, strict=True)
+            if count
+        }
+
+    @property
+    def squares(self) -> float:
+        """Squared error over noise variance, all trials and outputs together."""
+        return float((self.mse * self.count).sum())
+
+    @property
+    def belief(self) -> float:
+        """Squared distance from what the model file believes, in its standard deviations."""
+        return sum(
+            ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
+            for u, v in zip(self.unknowns, self.values, strict=True)
+            if np.isfinite(u.tolerance)
+        )
+
+    @property
+    def normalised_error(self) -> float:
+        """Mean squared error over noise variance, all trials and outputs together."""
+        return float(np.nansum(self.mse * self.count) / self.count.sum())
+
+
+def fit(
+    model: Model,
+    trials: Sequence[Trial],
+    only: Sequence[str] | None = None,
+    iterations: int = 60,
+    reweight: bool = True,
+    horizon: float = np.inf,
+    start: Fit | None = None,
+    at: Mapping[str, float] | None = None,
+    own: Mapping[str, Mapping[str, float]] | None = None,
+    bounds: Mapping[str, float] | None = None,
+    thorough: bool = False,
+    reach: float = np.inf,
+    sure: bool = True,
+    progress: Progress = lambda what, done, total, best: None,
+) -> Fit:
+    """Identify a model's parameters from trials.
+
+    Args:
+        model: What is believed: values, tolerances, bounds. The search sets out from there.
+        trials: Prepared records (trial.prepare).
+        only: Full names of the parameters to identify; by default all that are free.
+        iterations: Limit for the last, full-length stage.
+        reweight: Let the weights follow the residual that is left.
+        horizon: Use only this much of each record, in s: a cheap first look.
+        start: Set out from this fit of the same unknowns to a shorter horizon instead.
+        at: Set out from these values (full name -> value) instead of those of the file.
+        own: Name of a trial -> first guesses, by full name, of what it has of its own beyond its
+            initial motion (`own_unknowns`); without one the model's value is the guess.
+        bounds: Parameters that stay near the model's value (`unknowns_of`).
+        thorough: Down to the very bottom, at several times the cost: until a tenth of a squared
+            standard deviation is all that is left to gain, with finer integration. For values
+            that are to be as good as their intervals say.
+        reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
+        sure: Whether to work out how sure the values are, a tenth of the time of a short fit.
+        progress: Called with (what, done, total, how good it is so far in words).
+
+    Raises:
+        IdentificationError: if the model cannot be simulated along the data at all.
+    """
+    if not trials:
+        raise IdentificationError('no record to identify from; at least one is needed')
+    began = clock.perf_counter()
+    unknowns = unknowns_of(model, only, bounds)
+    refinement = REFINED if thorough else 1.0
+    problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}), refinement)
+    values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
+    theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
+    motions = list(problem.guesses if start is None else start.motions)
+    longest = min(max(trial.duration for trial in trials), horizon)
+    weight = 1.0 if start is None else 1 / start.inflation
+    place = kept_fits.place_of(
+        model, trials, names=[u.name for u in unknowns], theta=theta, motions=motions,
+        guesses=problem.guesses, longest=longest, weight=weight, reweight=reweight,
+        behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
+        thorough=thorough, reach=reach,
+    )  # fmt: skip
+    end = _End.of(kept_fits.recall(place))
+    if end is None:
+        stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+        end = _descend(
+            problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
+            reach, progress,
+        )  # fmt: skip
+        kept_fits.keep(place, end.numbers())
+    values = problem.values(end.theta)
+    covariance, information, sigmas = (
+        uncertainty(problem, end.theta, end.motions, longest, end.weight)
+        if sure else not_asked(problem)
+    )  # fmt: skip
+    unsettled = len(unsettled_states(model))
+    values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
+    fitted = _with_uncertainty(model, unknowns, values, covariance)
+    result = Fit(
+        model=fitted,
+        unknowns=unknowns,
+        values=values,
+        covariance=covariance,
+        information=information,
+        motions=tuple(end.motions),
+        own=problem.own,
+        own_sigmas=tuple(s[unsettled:] for s in sigmas),
+        starts=_demanded(
+            [m[len(t.motion) :][:unsettled] for t, m in zip(trials, end.motions, strict=True)],
+            [s[:unsettled] for s in sigmas],
+        ),
+        cost=end.cost,
+        mse=end.sse / np.maximum(end.count, 1),
+        count=end.count,
+        inflation=1 / end.weight,
+        horizon=longest,
+        evaluations=problem.evaluations,
+        seconds=clock.perf_counter() - began,
+        refinement=refinement,
+        converged=end.converged,
+    )
+    return replace(result, warnings=tuple(_warnings(result, bounds or ()))) if sure else result
+
+
+def _descend(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizons: Sequence[float],
+    weight: float,
+    iterations: int,
+    reweight: bool,
+    thorough: bool,
+    reach: float,
+    progress: Progress,
+) -> _End:
+    """From a start to the minimum: over short horizons, then the last in rounds of weights."""
+    *stages, longest = horizons
+    found = _Descent(theta, motions, None, False)
+    at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
+    rounds = max(1, iterations // max(1, at_once))
+    for k, horizon in enumerate(stages):
+        progress(f'fitting the first {horizon:g} s', k, len(stages) + rounds, _so_far(found))
+        # The short horizons only lead the way; the belief of the file keeps them sober.
+        ahead = _minimise(
+            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
+        )
+        if ahead.point is not None:
+            found = ahead
+            weight = _weight(problem, ahead.point) if reweight else 1.0
+        if found.hopeless:
+            at_once, rounds = 0, 1
+            break
+    for k in range(rounds):
+        progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
+        found = _minimise(
+            problem, found.theta, found.motions, longest, weight, at_once,
+            0.0 if thorough else DRIFT, reach,
+        )  # fmt: skip
+        if found.point is None:
+            raise IdentificationError(
+                f'model {problem.model.name!r} runs away along the data '
+                f'({", ".join(t.name for t in problem.trials)}); its values are too far off, or '
+                'the records are too long for an unstable motion: cut them into windows'
+            )
+        new = _weight(problem, found.point) if reweight else 1.0
+        # A minimum under weights that are about to change is none yet.
+        converged = found.converged and bool(abs(np.log(new / weight)) < STEADY)
+        if converged or found.hopeless:
+            break
+        weight = new
+    point = found.point
+    assert point is not None
+    return _End(
+        found.theta, found.motions, float(point.cost), point.sse, point.count, float(weight),
+        converged,
+    )  # fmt: skip
+
+
+def _guesses(
+    model: Model, trials: Sequence[Trial], own: Mapping[str, Mapping[str, float]]
+) -> list[np.ndarray]:
+    stated = {u.name: u.prior for u in own_unknowns(model)}
+    settled = [0.0] * len(unsettled_states(model))
+    return [
+        np.array(
+            [
+                *trial.motion, *settled,
+                *(own.get(trial.name, {}).get(n, v) for n, v in stated.items()),
+            ]
+        )
+        for trial in trials
+    ]
+
+
+def _minimise(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    weight: float,
+    iterations: int,
+    drift: float,
+    reach: float,
+    leading: bool = False,
+) -> _Descent:
+    lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
+                      for u in problem.unknowns])
+    upper = np.array([u.to_coordinate(u.upper) for u in problem.unknowns])
+    point = evaluate(problem, theta, motions, horizon, weight)
+    if point is None:
+        return _Descent(theta, motions, None, False)
+    damping = 1e-3
+    errors = []
+
+    def frozen(theta, point):
+        """Unknowns that stay where they are, shape (k,)."""
+        _, gradient, _ = reduced(point, 0.0)
+        at_bounds = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+        return at_bounds | _unseen(problem, theta, point, weight) if leading else at_bounds
+
+    # The border's weight follows what is still to be gained (a central path): whoever meets the
+    # border early creeps along it ever after.
+    barrier = max(BARRIER, CENTRAL * min(_promised(point, frozen(theta, point)), point.cost))
+    point = point.beside(BARRIER, barrier)
+
+    def ahead(theta, motions, point, damping):
+        """A damped Gauss-Newton step from a point: where it leads, and the point there."""
+        step, factors = _step(point, damping, frozen(theta, point))
+        reached = np.clip(theta + _straight(problem, step), lower, upper)
+        step = reached - theta
+        there_own = moved(problem, motions, factors, step)
+        there = evaluate(problem, reached, there_own, horizon, weight)
+        return reached, there_own, there.beside(BARRIER, barrier) if there is not None else None
+
+    for _ in range(iterations):
+        check_time()
+        errors.append(point.sse.sum() / point.count.sum())
+        if _out_of_reach(errors, reach):
+            return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
+        trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
+        for _ in range(BACK):
+            if candidate is None or not point.cost < candidate.cost < UPHILL * point.cost:
+                break
+            # A step along a curved valley leaves its floor: back to it, across the valley.
+            back = ahead(trial_theta, trial_motions, candidate, max(ACROSS, damping))
+            if back[2] is None or back[2].cost > candidate.cost:
+                break
+            trial_theta, trial_motions, candidate = back
+        if candidate is not None and candidate.cost < point.cost:
+            gain = point.cost - candidate.cost
+            theta, motions, point = trial_theta, trial_motions, candidate
+            damping = max(damping / 10, 1e-9)
+            small = max(drift * candidate.cost, SMALL_GAIN)
+            little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
+            # A short step gains little too.
+            if little and _promised(point, frozen(theta, point)) < small:
+                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
+            lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
+            point, barrier = point.beside(barrier, lower_barrier), lower_barrier
+        else:
+            if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:
+                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
+            damping *= 10
+            if damping > 1e8:
+                # No step is short enough: a minimum, or a corner of what bodies can be.
+                return _Descent(
+                    theta, motions, point.beside(barrier, BARRIER), candidate is not None
+                )
+    return _Descent(theta, motions, point.beside(barrier, BARRIER), False)
+
+
+def _out_of_reach(errors: Sequence[float], reach: float) -> bool:
+    """Whether errors that fell like this will not soon come to what matters."""
+    if len(errors) <= PATIENCE:
+        return False
+    return errors[-1] - reach > HOPE * (errors[-1 - PATIENCE] - errors[-1])
+
+
+def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:
+    """A step along which the values of logarithmic unknowns change by what it says at its start.
+
+    Stiffness and inertias make up for each other in proportion to their values: in logarithms
+    the valley of the cost would be curved.
+    """
+    logarithmic = np.array([u.logarithmic for u in problem.unknowns], bool)
+    factor = np.log1p(np.maximum(step, -HALF))
+    return np.where(logarithmic, np.where(step > -HALF, factor, factor + 2 * (step + HALF)), step)
+
+
+def _promised(point: Point, frozen: np.ndarray) -> float:
+    """What a full step would lower the cost by, were it quadratic."""
+    _, gradient, _ = reduced(point, 0.0)
+    return float(-gradient @ _step(point, 0.0, frozen)[0])
+
+
+def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray, list]:
+    h, g, factors = reduced(point, damping)
+    free = ~frozen
+    step = np.zeros(len(g))
+    if free.any():
+        # What is left of a curvature may be less than its rounding: nothing, or below.
+        floor = np.maximum(ROUNDING * np.diag(point.shared_hessian)[free], 1e-300)
+        scale = np.sqrt(np.maximum(np.diag(h)[free], floor))
+        scaled = h[np.ix_(free, free)] / np.outer(scale, scale)
+        step[free] = -np.linalg.lstsq(scaled, g[free] / scale, rcond=1e-12)[0] / scale
+    return step, factors
+
+
+def _unseen(
+    problem: Problem, theta: np.ndarray, point: Point, weight: float
+) -> np.ndarray:
+    """Unknowns whose typical change these few seconds do not notice, such as a late push."""
+    values = problem.values(theta)
+    scales = np.array([u.scale for u in problem.unknowns]) / problem.chain(values)
+    return np.diag(point.shared_hessian) * scales**2 < weight
+
+
+def _weight(problem: Problem, point: Point) -> float:
+    step = np.median(np.concatenate([np.diff(trial.time) for trial in problem.trials]))
+    return float(weight_of(point.sse.sum() / point.count.sum(), step))
+
+
+def _demanded(away: Sequence[np.ndarray], sigmas: Sequence[np.ndarray]) -> float:
+    """Twice the nats that starts of extra states cost, by Laplace's approximation.
+
+    Each was believed to be 0 +- 1: what it is away from that, and how much narrower the data make
+    it. What they do not see costs nothing.
+    """
+    narrower = np.clip(np.concatenate(sigmas), 1e-6, 1.0)
+    return float((np.concatenate(away) ** 2).sum() - 2 * np.log(narrower).sum())
+
+
+def _as_waves_are_written(
+    model: Model, unknowns: Sequence[Unknown], values: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same fit in the one form of a wave that all fits report (Effect.wave)."""
+    values, sign = values.copy(), np.ones(len(values))
+    place = {u.name: i for i, u in enumerate(unknowns)}
+    for effect in model.effects:
+        amplitude, phase = (place.get(f'{effect.label}.{n}') for n in effect.wave or ('', ''))
+        if amplitude is None or phase is None:
+            continue
+        if values[amplitude] < 0:
+            values[amplitude] *= -1
+            values[phase] += np.pi
+            sign[amplitude] = -1
+        values[phase] = np.pi - (np.pi - values[phase]) % (2 * np.pi)
+    return values, covariance * np.outer(sign, sign)
+
+
+def _with_uncertainty(
+    model: Model, unknowns: tuple[Unknown, ...], values: np.ndarray, covariance: np.ndarray
+) -> Model:
+    model = model.with_values({u.name: v for u, v in zip(unknowns, values, strict=True)})
+    quantities = dict(model.quantities)
+    for j, (u, v) in enumerate(zip(unknowns, values, strict=True)):
+        sigma = np.sqrt(max(covariance[j, j], 0.0)) * (abs(v) if u.logarithmic else 1.0)
+        if np.isfinite(sigma):
+            quantities[u.name] = replace(
+                quantities[u.name], tolerance=float(sigma), source='identified'
+            )
+    return replace(model, quantities=quantities)
+
+
+def _warnings(fit: Fit, bounds: Collection[str]):
+    sigmas = fit.sigmas
+    for u, value, sigma, share in zip(
+        fit.unknowns, fit.values, sigmas, fit.information, strict=True
+    ):
+        if u.name in bounds:
+            continue  # the bound is a statement, not a finding
+        unit = '' if u.unit == '1' else f' {u.unit}'
+        span = u.upper - u.lower
+        declared = fit.model.declarations[u.name]
+        meant = declared.bounded or value == declared.neutral
+        if min(value - u.lower, u.upper - value) <= 1e-6 * span and not meant:
+            yield f'{u.name} = {value:.4g}{unit} lies at the edge of its range'
+        if not np.isfinite(sigma):
+            yield f'{u.name} cannot be identified from these records'
+        elif u.name in fit.undetermined:
+            yield (
+                f'{u.name} = {value:.2g} +- {sigma:.2g}{unit} is not determined by these '
+                'records: what acts like this need not be what it is named after'
+            )
+        elif share < 0.2 and np.isfinite(u.tolerance):
+            yield (
+                f'{u.name} is hardly seen by these records: its value is mostly what the '
+                'model file believed'
+            )
+        if np.isfinite(u.tolerance):
+            away = abs(u.to_coordinate(value) - u.to_coordinate(u.prior)) / u.tolerance
+            if away > 3:
+                yield (
+                    f'{u.name} = {value:.4g}{unit} is {away:.1f} tolerances away from what '
+                    f'the model file believes ({u.prior:.4g})'
+                )
+    finite = np.isfinite(np.diag(fit.covariance))
+    spread = np.sqrt(np.where(finite, np.diag(fit.covariance), 1))
+    for a in range(len(spread)):
+        for b in range(a):
+            if finite[a] and finite[b] and spread[a] and spread[b]:
+                r = fit.covariance[a, b] / (spread[a] * spread[b])
+                if abs(r) > 0.98:
+                    yield (
+                        f'{fit.unknowns[b].name} and {fit.unknowns[a].name} are told apart only '
+                        f'poorly: correlation {r:+.3f}'
+                    )
+
+
+def in_trial(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
+    """The model with what a trial has of its own (Fit.motions), and its start, (nx,).
+
+    The start is as `CompiledModel.initial_state` takes it.
+    """
+    unknowns = own_unknowns(model)
+    happened = dict(zip((u.name for u in unknowns), own_values(unknowns, own), strict=True))
+    model = model.with_values(happened)
+    start = own[: len(own) - len(unknowns)]
+    states = unsettled_states(model)
+    acting = {f'{e.label}.{s}' for e in acting_effects(model) for s in e.states}
+    taken = [True] * (len(start) - len(states)) + [name in acting for name in states]
+    return model, start[np.array(taken, bool)]
+
+
+def predict(
+    model: Model, trial: Trial, motion: np.ndarray, refinement: float = 1.0
+) -> np.ndarray:
+    """Outputs that a model simulates along a trial, shape (n, ny).
+
+    Args:
+        model: The model.
+        trial: The trial.
+        motion: What the trial has of its own (Fit.motions).
+        refinement: As the fit's.
+    """
+    model, motion = in_trial(model, motion)
+    compiled = compile_model(model, trial.setup)
+    p = parameter_vector(model, trial.setup)
+    u = trial.inputs_for(compiled.input_names)
+    x0 = compiled.initial_state(motion, u[0], p)
+    return compiled.readings(trial.time, u, x0, p, refinement)
+
+
+def score(
+    model: Model,
+    trials: Sequence[Trial],
+    unseen: Sequence[str] = (),
+    own: Mapping[str, Mapping[str, float]] | None = None,
+    bounds: Mapping[str, float] | None = None,
+    thorough: bool = False,
+    reach: float = np.inf,
+) -> Fit:
+    """How well a model simulates trials that it was not fitted to.
+
+    Only what each trial has of its own is fitted: its initial motion, as no recording states it
+    exactly, and what happened in it alone, from the guess `own` (see `fit`); and parameters
+    `unseen` of which the others could tell nothing, as the shape of a push that none of them had.
+    """
+    return fit(
+        model, trials, only=unseen, own=own, bounds=bounds, thorough=thorough, reach=reach
+    )

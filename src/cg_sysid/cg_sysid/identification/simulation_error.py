@@ -1,0 +1,353 @@
+"""The simulation error of many records and its normal equations: theory.md, (ID).
+
+One evaluation simulates every trial with exact sensitivities and adds up the normal equations.
+Each trial's own unknowns, its initial motion, couple to the shared parameters only, so that a
+Schur complement leaves a system as small as the number of parameters, however many records. Where
+trials are pieces of one recording and share something of its own, they are eliminated together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiled import CompiledModel, Normal, compile_model
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.unknowns import Unknown, awake, own_unknowns, unsettled_states
+from cg_sysid.parallel import side_by_side
+
+RUNAWAY = 1e60
+BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
+
+
+@dataclass
+class Problem:
+    """Compiled models and constants of one fit.
+
+    What a trial has of its own is one vector: its initial motion, how far extra states are from
+    settled at its start (`unsettled_states`, in their spreads), then the values of
+    `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
+    `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
+    place of one.
+    """
+
+    model: Model
+    trials: Sequence[Trial]
+    unknowns: tuple[Unknown, ...]
+    guesses: Sequence[np.ndarray]
+    refinement: float = 1.0
+    spreads: list[np.ndarray] = field(default_factory=list)
+    own: tuple[Unknown, ...] = ()
+    blocks: tuple['Block', ...] = ()
+    compiled: list[CompiledModel] = field(default_factory=list)
+    vectors: list[np.ndarray] = field(default_factory=list)
+    places: list[np.ndarray] = field(default_factory=list)
+    own_places: list[np.ndarray] = field(default_factory=list)
+    starts: list[np.ndarray] = field(default_factory=list)
+    columns: list[np.ndarray] = field(default_factory=list)
+    inputs: list[np.ndarray] = field(default_factory=list)
+    evaluations: int = 0
+
+    def __post_init__(self):
+        names = tuple(u.name for u in self.unknowns)
+        self.own = own_unknowns(self.model)
+        unsettled = unsettled_states(self.model)
+        own = [u.name for u in self.own]
+        default = compile_free(self.model, names)
+        model = awake(self.model)
+        for trial in self.trials:
+            compiled = compile_model(model, trial.setup, default)
+            m2 = 2 * compiled.equations.coordinates
+            order = [*unsettled, *own, *names]
+            self.spreads.append(
+                np.concatenate(
+                    [trial.motion_sigma, np.ones(len(unsettled)), [u.tolerance for u in self.own]]
+                )
+            )
+            at = [m2 + unsettled.index(s) for s in compiled.state_names[m2:]]
+            self.starts.append(np.concatenate([np.arange(m2), at]).astype(int))
+            self.own_places.append(
+                np.array([compiled.parameter_names.index(n) for n in own], int)
+            )
+            self.compiled.append(compiled)
+            self.inputs.append(trial.inputs_for(compiled.input_names))
+            self.vectors.append(parameter_vector(self.model, trial.setup))
+            self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
+            self.columns.append(
+                np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)
+            )
+        self.consistency = _consistency(self.model, names)
+        self.blocks = _blocks(self.trials, self.own, len(unsettled))
+        shared = np.array([u.each == 'recording' for u in self.own], bool)
+        for block in self.blocks:
+            for i in block.trials[1:]:
+                # What a recording has of its own is believed once.
+                self.spreads[i][len(self.spreads[i]) - len(shared) :][shared] = np.inf
+
+    def spread(self, i: int, weight: float) -> np.ndarray:
+        """How far what trial i has of its own may lie from its first guess.
+
+        The guess of a motion was made from the same data and weighs as they do: a simulation that
+        is wrong starts as far from where the machine did as it goes on.
+        """
+        scale = np.ones(len(self.spreads[i]))
+        scale[: len(self.trials[i].motion)] /= np.sqrt(weight)
+        return self.spreads[i] * scale
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """Coordinates -> values."""
+        return np.array([u.to_value(c) for u, c in zip(self.unknowns, theta, strict=True)])
+
+    def chain(self, values: np.ndarray) -> np.ndarray:
+        """d(value)/d(coordinate)."""
+        return np.array(
+            [v if u.logarithmic else 1.0 for u, v in zip(self.unknowns, values, strict=True)]
+        )
+
+
+@dataclass(frozen=True)
+class Block:
+    """Trials whose own unknowns are eliminated together.
+
+    Attributes:
+        trials: Their numbers.
+        places: Of each, where its own vector lies in the block's.
+        size: Length of the block's.
+    """
+
+    trials: tuple[int, ...]
+    places: tuple[np.ndarray, ...]
+    size: int
+
+
+def _blocks(
+    trials: Sequence[Trial], own: Sequence[Unknown], unsettled: int
+) -> tuple[Block, ...]:
+    """Each trial alone or, where something belongs to a recording, with the others of that."""
+    shared = np.array([u.each == 'recording' for u in own], bool)
+    together: dict[str, list[int]] = {}
+    for i, trial in enumerate(trials):
+        together.setdefault(trial.recording if shared.any() else str(i), []).append(i)
+    blocks = []
+    for members in together.values():
+        places, size = [], int(shared.sum())
+        for i in members:
+            first = len(trials[i].motion) + unsettled
+            alone = first + int((~shared).sum())
+            place = np.empty(first + len(own), int)
+            place[np.concatenate([np.ones(first, bool), ~shared])] = size + np.arange(alone)
+            place[np.concatenate([np.zeros(first, bool), shared])] = np.arange(shared.sum())
+            places.append(place)
+            size += alone
+        blocks.append(Block(tuple(members), tuple(places), size))
+    return tuple(blocks)
+
+
+def compile_free(model: Model, names: Sequence[str]) -> tuple[str, ...] | None:
+    """Parameters to compile sensitivities for: all declared free, and those asked for besides."""
+    declared = model.declarations
+    if all(declared[name].free for name in names):
+        return None
+    return tuple(n for n, p in declared.items() if p.free or n in names)
+
+
+def _consistency(model: Model, names: tuple[str, ...]):
+    symbols = {name: ca.SX.sym(name) for name in model.declarations}
+    conditions = model.mechanism.consistency(symbols)
+    if not conditions or not names:
+        return None
+    stacked = ca.vertcat(*conditions)
+    moved = ca.vertcat(*(symbols[name] for name in names))
+    function = ca.Function(
+        'consistency', list(symbols.values()), [stacked, ca.jacobian(stacked, moved)]
+    )
+    fixed = model.values
+
+    def evaluate(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        numbers = {**fixed, **dict(zip(names, values, strict=True))}
+        stack, jacobian = function(*numbers.values())
+        return np.asarray(stack).ravel(), np.asarray(ca.densify(jacobian))
+
+    return evaluate
+
+
+@dataclass(frozen=True)
+class Border:
+    """What keeps bodies possible, for a barrier of weight one: cost, gradient, curvature."""
+
+    cost: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+
+@dataclass(frozen=True)
+class Point:
+    """Cost and normal equations at one point, the border of consistency with weight BARRIER.
+
+    Own are curvature, coupling to what is shared, and gradient of each block of the problem.
+    """
+
+    cost: float
+    shared_hessian: np.ndarray
+    shared_gradient: np.ndarray
+    own: list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # D, E, g
+    sse: np.ndarray
+    count: np.ndarray
+    data_cost: float
+    border: Border
+
+    def beside(self, before: float, barrier: float) -> 'Point':
+        """The same with another weight of the border."""
+        more = barrier - before
+        return replace(
+            self,
+            cost=self.cost + more * self.border.cost,
+            shared_gradient=self.shared_gradient + more * self.border.gradient,
+            shared_hessian=self.shared_hessian + more * self.border.hessian,
+        )
+
+
+def evaluate(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> Point | None:
+    """Cost and normal equations at one point; None where the simulation runs away."""
+    k = len(theta)
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
+    own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    cost = 0.0
+    border = Border(0.0, shared_g, shared_h)
+    ny = len(problem.trials[0].sigma)
+    sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
+    if problem.consistency is not None:
+        c, jacobian = problem.consistency(values)
+        if not (c > 0).all():
+            return None
+        jacobian = jacobian * chain / c[:, None]
+        border = Border(-2 * np.log(c).sum(), -jacobian.sum(axis=0), jacobian.T @ jacobian)
+    problem.evaluations += 1
+    simulated = side_by_side(
+        lambda i: simulate_sensitive(problem, i, values, motions[i], horizon),
+        range(len(problem.trials)),
+    )
+    for i, (n, normal, _, _) in enumerate(simulated):
+        m2 = len(motions[i])
+        # Sensitivities can run away before the motion does.
+        if normal.rows < n or not np.abs(normal.hessian).max() < RUNAWAY:
+            return None
+        h, g = normal.hessian * weight, normal.gradient * weight
+        h[m2:] *= chain[:, None]
+        h[:, m2:] *= chain
+        g[m2:] *= chain
+        sse[i], count[i] = normal.sse, normal.count
+        spread = problem.spread(i, weight)
+        away = (motions[i] - problem.guesses[i]) / spread
+        own_h = h[:m2, :m2] + np.diag(1 / spread**2)
+        own_g = g[:m2] + away / spread
+        own[i] = own_h, h[:m2, m2:], own_g
+        shared_h += h[m2:, m2:]
+        shared_g += g[m2:]
+        cost += weight * normal.sse.sum() + away @ away
+    data_cost = cost
+    for j, u in enumerate(problem.unknowns):
+        if np.isfinite(u.tolerance):
+            away = (theta[j] - u.to_coordinate(u.prior)) / u.tolerance
+            cost += away**2
+            shared_g[j] += away / u.tolerance
+            shared_h[j, j] += 1 / u.tolerance**2
+    blocks = [_together(block, own, k) for block in problem.blocks]
+    point = Point(cost, shared_h, shared_g, blocks, sse, count, data_cost, border)
+    return point.beside(0.0, BARRIER)
+
+
+def _together(
+    block: Block, own: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]], k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Curvature, coupling to the k shared unknowns and gradient of a block."""
+    d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
+    for i, place in zip(block.trials, block.places, strict=True):
+        d[np.ix_(place, place)] += own[i][0]
+        e[place] += own[i][1]
+        g[place] += own[i][2]
+    return d, e, g
+
+
+def simulate_sensitive(
+    problem: Problem,
+    i: int,
+    values: np.ndarray,
+    motion: np.ndarray,
+    horizon: float,
+    keep: bool = False,
+) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
+    """One trial: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
+
+    Columns: what the trial has of its own, then the shared values (not coordinates).
+    """
+    trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
+    p = problem.vectors[i].copy()
+    p[problem.places[i]] = values
+    p[problem.own_places[i]] = own_values(problem.own, motion)
+    n = int(np.searchsorted(trial.time, horizon, side='right'))
+    start = problem.starts[i]
+    x0, by_start, by_free = compiled.initial_sensitivity(motion[start], u[0], p)
+    s0 = np.zeros((compiled.nx, len(motion) + len(values)))
+    s0[:, start] = by_start
+    for f, column in enumerate(problem.columns[i]):
+        if column >= 0:
+            s0[:, column] = by_free[:, f]
+    normal, y, jacobian = compiled.normal(
+        trial.time[:n], u[:n], x0, s0, p, problem.columns[i], trial.outputs[:n], 1 / trial.sigma,
+        keep=keep, refinement=problem.refinement,
+    )  # fmt: skip
+    return n, normal, y, jacobian
+
+
+def moved(
+    problem: Problem,
+    motions: Sequence[np.ndarray],
+    factors: Sequence[np.ndarray],
+    step: np.ndarray,
+) -> list[np.ndarray]:
+    """What each trial has of its own after a step of the shared unknowns (`reduced`)."""
+    found = list(motions)
+    for block, solved in zip(problem.blocks, factors, strict=True):
+        move = -(solved[:, -1] + solved[:, :-1] @ step)
+        for i, place in zip(block.trials, block.places, strict=True):
+            found[i] = motions[i] + move[place]
+    return found
+
+
+def own_values(own: Sequence[Unknown], motion: np.ndarray) -> np.ndarray:
+    """Of what a trial has of its own, the values behind the initial motion, within range."""
+    values = motion[len(motion) - len(own) :]
+    return np.clip(values, [u.lower for u in own], [u.upper for u in own])
+
+
+def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]:
+    """Schur complement on the shared unknowns, with Marquardt damping on every diagonal."""
+    h = point.shared_hessian + damping * np.diag(np.diag(point.shared_hessian))
+    g = point.shared_gradient.copy()
+    factors = []
+    for d, e, own_g in point.own:
+        damped = d + damping * np.diag(np.diag(d))
+        solved = solve(damped, np.column_stack([e, own_g]))
+        h -= e.T @ solved[:, :-1]
+        g -= e.T @ solved[:, -1]
+        factors.append(solved)
+    return h, g, factors
+
+
+def solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The x of a x = b for a curvature a; directions lost beside far steeper ones stay."""
+    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+    scaled, b = a / np.outer(scale, scale), b / scale[:, None]
+    try:
+        x = np.linalg.solve(scaled, b)
+    except np.linalg.LinAlgError:
+        x = np.linalg.lstsq(scaled, b, rcond=1e-12)[0]
+    return x / scale[:, None]

@@ -1,0 +1,129 @@
+"""How sure identified values are: theory.md, (COV)."""
+
+import numpy as np
+
+from cg_sysid.identification.simulation_error import (
+    Point,
+    Problem,
+    evaluate,
+    reduced,
+    simulate_sensitive,
+    solve,
+)
+
+SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
+
+
+def uncertainty(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """How sure the values are: theory.md, (COV).
+
+    Returns:
+        Covariance of the coordinates (k, k), the share of each that comes from data (k,), and
+        the standard deviations of what each trial has of its own behind its initial motion: how
+        far extra states are from settled, and its own values.
+
+    Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
+    right for white residuals, and the sandwich of scores summed over blocks longer than their
+    correlation, right where the model leaves slow waves.
+    """
+    point = evaluate(problem, theta, motions, horizon, weight)
+    k = len(theta)
+    if point is None:
+        return np.zeros((k, k)), np.zeros(k), _unknown(problem)
+    excess = max(1.0, point.sse.sum() / point.count.sum())
+    rescale = 1 / (excess * weight)
+    if not k:
+        none = np.zeros((0, 0))
+        return none, np.zeros(0), _own_sigmas(problem, point, none, rescale)
+    belief = np.array(
+        [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in problem.unknowns]
+    )
+    h, _, _ = reduced(point, 0.0)
+    h = (h - np.diag(belief)) * rescale + np.diag(belief)
+    inverse, lost = _inverse(h)
+    scores = _block_scores(problem, theta, motions, horizon, point, weight) * rescale
+    sandwich = inverse @ (scores.T @ scores + np.diag(belief)) @ inverse
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
+    covariance = inverse * np.outer(ratio, ratio)
+    covariance[lost, lost] = np.inf
+    certain = np.where(belief > 0, np.diag(covariance), 0.0)
+    information = 1 - np.clip(certain * belief, 0, 1)
+    information[lost] = 0.0
+    return covariance, information, _own_sigmas(problem, point, covariance, rescale)
+
+
+def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """In place of `uncertainty` where nobody asks for it: NaN, and starts as they are believed."""
+    k = len(problem.unknowns)
+    return (
+        np.full((k, k), np.nan), np.full(k, np.nan),
+        tuple(np.ones_like(own) for own in _unknown(problem)),
+    )  # fmt: skip
+
+
+def _own_sigmas(
+    problem: Problem, point: Point, covariance: np.ndarray, rescale: float
+) -> tuple[np.ndarray, ...]:
+    """Standard deviation of each trial's own values, what is shared being uncertain too."""
+    found = list(_unknown(problem))
+    if not any(map(len, found)):
+        return tuple(found)
+    shared = np.where(np.isfinite(covariance), covariance, 0.0)
+    for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
+        moved = solve(own, cross)
+        spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
+        sigmas = np.sqrt(np.maximum(np.diag(spread), 0.0))
+        for i, place in zip(block.trials, block.places, strict=True):
+            found[i] = sigmas[place][len(problem.trials[i].motion) :]
+    return tuple(found)
+
+
+def _unknown(problem: Problem) -> tuple[np.ndarray, ...]:
+    return tuple(
+        np.zeros(len(guess) - len(trial.motion))
+        for guess, trial in zip(problem.guesses, problem.trials, strict=True)
+    )
+
+
+def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of the curvature, and which unknowns it leaves undetermined."""
+    diagonal = np.diag(h)
+    scale = np.sqrt(np.where(diagonal > 1e-200 * diagonal.max(), diagonal, 1.0))
+    eigenvalues, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    # A direction that neither data nor belief determine has infinite variance, not a crash.
+    kept = eigenvalues > 1e-13 * eigenvalues.max()
+    inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T
+    lost = (vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6
+    return inverse / np.outer(scale, scale), lost
+
+
+def _block_scores(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    point: Point,
+    weight: float,
+) -> np.ndarray:
+    """Gradient of the cost by the shared unknowns, block by block of time, shape (blocks, k)."""
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    blocks = []
+    # What moves of each trial's own with what is shared, shape (own, k).
+    follows: dict[int, np.ndarray] = {}
+    for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
+        solved = solve(own, cross)
+        follows |= {i: solved[p] for i, p in zip(block.trials, block.places, strict=True)}
+    for i, trial in enumerate(problem.trials):
+        n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
+        assert y is not None
+        assert jacobian is not None
+        residual = np.nan_to_num((y - trial.outputs[:n]) / trial.sigma**2) * weight
+        rows = np.einsum('kj,kjc->kc', residual, jacobian)
+        edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))
+        sums = np.add.reduceat(rows, edges, axis=0)
+        m2 = len(motions[i])
+        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ follows[i])
+    return np.vstack(blocks)

@@ -1,0 +1,1 @@
+"""How the feet of a walking robot land: impulses, fits of contact laws, selection."""

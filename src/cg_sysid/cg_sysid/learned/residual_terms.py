@@ -1,0 +1,399 @@
+"""Which function of which variable could be missing: learned terms on short pieces of motion.
+
+By (RESP) of response.py what a model misses on a piece is linear in a missing torque or sensor
+error, and a learned term is linear in its coefficients: so a ridge regression fits it, beside
+all parameters of the model,
+
+    min over dtheta, c of  w |r - J dtheta - H g(c)|^2 + |theta - theta_file|^2 + |c|^2    (SKETCH)
+
+each squared distance in its own standard deviations. How well a term does is asked twice: what is
+learned on the training records is judged on those held out, and the other way round. The same
+choice says how smooth a function should be and with which period it repeats.
+"""
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cg_dynamics.effects import UNMODELLED
+from cg_dynamics.effects.unmodelled import COSINES, JointTerm, LearnedEffect, SensorTerm
+from cg_dynamics.model import Model
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.information_criterion import weight_of
+from cg_sysid.learned.linear_response import SAMPLES_HZ, Piece, Pieces
+
+BEYOND = 0.05  # share of the range of data by which a smooth function goes beyond them
+ROUGHNESS = (1.5, 3.0, 6.0, 12.0, 24.0, 48.0)  # half waves beyond which coefficients fade
+SLACK = 10.0  # a coefficient may be so much larger than what explains everything by itself
+OVERSAMPLED = 2.0  # frequencies of the sweep per width of a spectral line
+PROMISING = 0.95  # share of the error that one wave of a series may leave
+REFINED = 9  # frequencies between two neighbours of the sweep
+MOST_CYCLES = 400.0  # per revolution
+WHIRLS = 20 * np.pi  # rad, of a joint that turns on and on
+MOST_STEPS = 200  # of a torque, over its range
+FASTEST_HZ = {False: 20.0, True: 60.0}  # in time: of a torque, of a sensor error
+FEWEST_PERIODS = 2.5  # seen in the data; less is a shape, not a repetition
+LONGER = 0.7  # share of the error that a multiple of a period may leave, or else it is not meant
+NEVER = 1e-3  # range of a variable, in its unit, below which nothing is learned over it
+Fold = dict[bool, np.ndarray]
+NONE = np.zeros(0)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A learned term, as the pieces suggest it.
+
+    Attributes:
+        effect: Where it acts and what it follows.
+        fixed: What its law needs beyond coefficients: low and high, or period.
+        tolerances: What is believed about each coefficient, one standard deviation.
+        start: Each coefficient as the pieces have it.
+        error: What is left of the error of other records, chi2 per sample.
+    """
+
+    effect: LearnedEffect
+    fixed: dict[str, float]
+    tolerances: dict[str, float]
+    start: dict[str, float]
+    error: float
+
+    @property
+    def label(self) -> str:
+        """Label of the effect."""
+        return self.effect.label
+
+    def added_to(self, model: Model) -> Model:
+        """The model with the term in it."""
+        extended = model.with_effect(
+            self.effect.name, self.effect.at, **self.fixed, **self.start
+        )
+        quantities = dict(extended.quantities)
+        for name, value in self.tolerances.items():
+            full = f'{self.label}.{name}'
+            quantities[full] = replace(quantities[full], tolerance=value)
+        return replace(extended, quantities=quantities)
+
+
+class Sketches:
+    """Learned terms, compared on pieces.
+
+    Args:
+        pieces: All records in pieces.
+        trials: The records, those to train on first.
+    """
+
+    def __init__(self, pieces: Pieces, trials: Sequence[Trial]):
+        unknowns = pieces.unknowns
+        self.trials, self.body = trials, pieces.model.mechanism
+        values = [pieces.model.values[u.name] for u in unknowns]
+        chain = np.array(
+            [v if u.logarithmic else 1.0 for u, v in zip(unknowns, values, strict=True)]
+        )
+        self.pieces = [replace(p, parameters=p.parameters * chain) for p in pieces.all]
+        self.precision = np.array([u.tolerance**-2.0 for u in unknowns])
+        self.centre = np.array(
+            [u.to_coordinate(u.prior) - u.to_coordinate(v)
+             for u, v in zip(unknowns, values, strict=True)]
+        )  # fmt: skip
+        self.swept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+        self.squares, self.samples = {False: 0.0, True: 0.0}, {False: 0, True: 0}
+        for p in self.pieces:
+            self.squares[p.held] += float(p.missed @ p.missed)
+            self.samples[p.held] += p.degrees
+
+    @functools.cached_property
+    def nothing(self) -> float:
+        """What is left with no term, parameters adjusted: chi2 per sample of other records."""
+        return float(self._errors(self._sums(self._no_columns()), NONE[None, :])[0])
+
+    def all(self) -> list[Term]:
+        """Every term that these records could show, best first."""
+        found: list[Term] = []
+        for effect in self._effects():
+            values = np.concatenate([self._variable(effect, piece) for piece in self.pieces])
+            if not len(values):
+                continue  # the error of a sensor that was not recorded
+            low, high = float(values.min()), float(values.max())
+            if high - low < NEVER:
+                continue
+            if effect.kind == 'smooth':
+                found.append(self._smooth(effect, low, high))
+            elif effect.kind == 'periodic':
+                found += self._periodic(effect, high - low)
+            else:
+                found += self._vibrating(effect, high - low)
+        return sorted(found, key=lambda term: term.error)
+
+    def _effects(self) -> Iterator[LearnedEffect]:
+        stances = {trial.setup.stance for trial in self.trials}
+        for cls in UNMODELLED.values():
+            for site in cls.sites(self.body):
+                # With one leg always standing, "the leg that stands" is another name for it.
+                if site == 'stance' and len(stances) == 1:
+                    continue
+                # An error that repeats belongs to the disc that turns.
+                if cls.kind == 'periodic' and ':' in site:
+                    continue
+                yield cls(self.body, site)
+
+    # --- what a term does to a piece -----------------------------------------------------------
+
+    def _variable(self, effect: LearnedEffect, piece: Piece) -> np.ndarray:
+        if not isinstance(effect, SensorTerm):
+            return piece.at_slots[effect.follows]
+        channel = self.body.outputs.index(effect.site.partition(':')[0])
+        return piece.at_samples[effect.follows][piece.samples == channel]
+
+    def _columns(self, effect: LearnedEffect, piece: Piece, basis: np.ndarray) -> np.ndarray:
+        """Response of a piece to each function of a basis, given at its slots or samples."""
+        place = effect.site.partition(':')[0]
+        if isinstance(effect, SensorTerm):
+            return piece.by_error(self.body.outputs.index(place), basis)
+        if isinstance(effect, JointTerm):
+            row = np.array(self.body.joints[place])
+            return piece.by_torque(row, self._carrier(effect, piece)[:, None] * basis)
+        leg = self.trials[piece.record].setup.stance if place == 'stance' else place
+        return piece.by_torque(np.eye(2)[self.body.bodies.index(leg)], basis)
+
+    def _carrier(self, effect: JointTerm, piece: Piece) -> np.ndarray:
+        joint = effect.site.partition(':')[0]
+        rate = piece.at_slots[f'rate:{joint}']
+        if effect.carrier == 'friction':
+            transition = next(p for p in effect.parameters if p.name == 'transition_rate')
+            return -np.tanh(rate / transition.default)
+        if effect.carrier == 'damping':
+            return -rate
+        if effect.carrier == 'gain':
+            return piece.at_slots[f'torque:{joint}']
+        return np.ones(len(rate))
+
+    # --- the three laws -----------------------------------------------------------------------
+
+    def _smooth(self, effect: LearnedEffect, low: float, high: float) -> Term:
+        margin = BEYOND * (high - low)
+        low, high = low - margin, high + margin
+        waves = np.arange(COSINES)
+        columns = []
+        for piece in self.pieces:
+            z = np.clip((self._variable(effect, piece) - low) / (high - low), 0, 1)
+            columns.append(self._columns(effect, piece, np.cos(np.pi * np.outer(z, waves))))
+        tolerances = self._size(columns) / (1 + (waves / np.array(ROUGHNESS)[:, None]) ** 2)
+        sums = self._sums(columns)
+        errors = self._errors(sums, tolerances)
+        best = int(np.argmin(errors))
+        fixed = {'low': low, 'high': high}
+        return self._term(effect, fixed, sums, tolerances[best], float(errors[best]))
+
+    def _periodic(self, effect: LearnedEffect, span: float) -> list[Term]:
+        frequencies = self._frequencies(effect, span)
+        if not len(frequencies):
+            return []
+        errors = self._sweep(effect, frequencies)[0]
+        if errors.min() > PROMISING * self.nothing:
+            return []
+        best = float(frequencies[int(np.argmin(errors))])
+        found = self._best_series(effect, best, span)
+        for divisor in (2, 3):
+            # The strongest wave need not be the first of its series, but every series is also one
+            # of twice the period.
+            if best / divisor >= FEWEST_PERIODS / span:
+                longer = self._best_series(effect, best / divisor, span)
+                found = longer if longer.error < LONGER * found.error else found
+        return [found]
+
+    def _best_series(self, effect: LearnedEffect, about: float, span: float) -> Term:
+        """The series of a frequency within a step of the sweep."""
+        nearby = about + np.linspace(-1, 1, REFINED) / (OVERSAMPLED * span)
+        series = [self._series(effect, float(frequency)) for frequency in nearby]
+        return min(series, key=lambda term: term.error)
+
+    def _series(self, effect: LearnedEffect, frequency: float) -> Term:
+        harmonics = np.arange(1, (len(effect.coefficients) + 1) // 2 + 1)[
+            : len(effect.coefficients) // 2
+        ]
+        columns = []
+        for piece in self.pieces:
+            s = self._variable(effect, piece)
+            turn = 2 * np.pi * frequency * np.outer(s, harmonics)
+            waves = np.stack([np.cos(turn), np.sin(turn)], axis=2).reshape(len(s), -1)
+            columns.append(self._columns(effect, piece, np.hstack([np.ones((len(s), 1)), waves])))
+        tolerances = np.full(len(effect.coefficients), self._size(columns))
+        sums = self._sums(columns)
+        error = float(self._errors(sums, tolerances[None, :])[0])
+        return self._term(effect, {'period': 1 / frequency}, sums, tolerances, error)
+
+    def _term(
+        self,
+        effect: LearnedEffect,
+        fixed: dict[str, float],
+        sums: tuple[Fold, Fold],
+        tolerances: np.ndarray,
+        error: float,
+    ) -> Term:
+        found = self._solve(sums, tolerances)[len(self.precision) :]
+        names = effect.coefficients
+        return Term(
+            effect,
+            fixed,
+            dict(zip(names, tolerances.tolist(), strict=True)),
+            dict(zip(names, found.tolist(), strict=True)),
+            error,
+        )
+
+    def _vibrating(self, effect: LearnedEffect, span: float) -> list[Term]:
+        frequencies = self._frequencies(effect, span)
+        if not len(frequencies):
+            return []
+        errors = self._sweep(effect, frequencies)[1]
+        best = int(np.argmin(errors))
+        period = 1 / float(frequencies[best])
+        return [Term(effect, {'period': period}, {}, {}, float(errors[best]))]
+
+    def _frequencies(self, effect: LearnedEffect, span: float) -> np.ndarray:
+        fastest = self._fastest(effect, span)
+        if effect.variable == 'angle' and span > WHIRLS:
+            # Thousands of frequencies would be told apart; what turns on repeats in whole turns.
+            return np.arange(1, fastest * 2 * np.pi + 0.5) / (2 * np.pi)
+        return np.arange(FEWEST_PERIODS / span, fastest, 1 / (OVERSAMPLED * span))
+
+    def _fastest(self, effect: LearnedEffect, span: float) -> float:
+        if effect.variable == 'angle':
+            return MOST_CYCLES / (2 * np.pi)
+        if effect.variable == 'torque':
+            return MOST_STEPS / span
+        step = max(float(np.median(np.diff(trial.time))) for trial in self.trials)
+        return min(FASTEST_HZ[isinstance(effect, SensorTerm)], 0.4 / step)
+
+    # --- sweeps -------------------------------------------------------------------------------
+
+    def _sweep(
+        self, effect: LearnedEffect, frequencies: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Error left by a mean and one wave of each frequency, shapes (frequencies,).
+
+        First with the same wave in all records, learned on one side and judged on the other, then
+        with a phase of each record's own, learned on every second piece and judged on the others.
+        """
+        key = (type(effect).__bases__, effect.site, effect.unit, effect.variable)
+        if key in self.swept:
+            return self.swept[key]
+        k, count = len(self.precision) + 1, len(frequencies)
+        h = {held: np.zeros((count, k + 2, k + 2)) for held in (False, True)}
+        g = {held: np.zeros((count, k + 2)) for held in (False, True)}
+        shared = self._solve(self._sums(self._no_columns()), NONE)
+        own: dict[tuple[int, bool], tuple[np.ndarray, np.ndarray]] = {}
+        left = 0.0
+        for i, piece in enumerate(self.pieces):
+            s = self._variable(effect, piece)
+            turn = 2 * np.pi * np.outer(s, frequencies)
+            basis = np.hstack([np.ones((len(s), 1)), np.cos(turn), np.sin(turn)])
+            columns = self._columns(effect, piece, basis)
+            common, waves = np.hstack([piece.parameters, columns[:, :1]]), columns[:, 1:]
+            across = (common.T @ waves).reshape(k, 2, count).transpose(2, 0, 1)
+            cosine, sine = waves[:, :count], waves[:, count:]
+            among = np.empty((count, 2, 2))
+            among[:, 0, 0], among[:, 1, 1] = (cosine**2).sum(axis=0), (sine**2).sum(axis=0)
+            among[:, 0, 1] = among[:, 1, 0] = (cosine * sine).sum(axis=0)
+            h[piece.held][:, :k, :k] += common.T @ common
+            h[piece.held][:, :k, k:] += across
+            h[piece.held][:, k:, :k] += across.transpose(0, 2, 1)
+            h[piece.held][:, k:, k:] += among
+            g[piece.held][:, :k] += common.T @ piece.missed
+            g[piece.held][:, k:] += (piece.missed @ waves).reshape(2, count).T
+            rest = piece.missed - piece.parameters @ shared
+            sums = own.setdefault(
+                (piece.record, i % 2 == 0), (np.zeros((count, 2, 2)), np.zeros((count, 2)))
+            )
+            sums[0].__iadd__(among)
+            sums[1].__iadd__((rest @ waves).reshape(2, count).T)
+            left += float(rest @ rest)
+        together = self._errors((h, g), np.full((count, 3), np.inf))
+        self.swept[key] = together, self._own_phases(own, np.full(count, left))
+        return self.swept[key]
+
+    def _own_phases(
+        self, own: dict[tuple[int, bool], tuple[np.ndarray, np.ndarray]], errors: np.ndarray
+    ) -> np.ndarray:
+        for (record, even), (h, g) in own.items():
+            if (record, not even) not in own:
+                continue
+            learned, target = own[record, not even]
+            ridge = 1e-9 * np.trace(learned, axis1=1, axis2=2)[:, None, None] + 1e-300
+            x = np.linalg.solve(learned + ridge * np.eye(2), target[:, :, None])[..., 0]
+            errors = errors + ((np.matmul(h, x[:, :, None])[..., 0] - 2 * g) * x).sum(axis=1)
+        return errors / sum(self.samples.values())
+
+    # --- ridge regression ---------------------------------------------------------------------
+
+    def _no_columns(self) -> list[np.ndarray]:
+        return [np.zeros((len(p.missed), 0)) for p in self.pieces]
+
+    def _size(self, columns: Sequence[np.ndarray]) -> float:
+        """Standard deviation that is no restriction: far beyond what explains everything."""
+        power = sum(float((c**2).sum()) for c in columns) / max(columns[0].shape[1], 1)
+        return SLACK * float(np.sqrt(sum(self.squares.values()) / max(power, 1e-300)))
+
+    def _sums(self, columns: Sequence[np.ndarray]) -> tuple[Fold, Fold]:
+        """Normal equations of parameters and coefficients on either side, with one batch axis."""
+        k = len(self.precision) + columns[0].shape[1]
+        h = {held: np.zeros((1, k, k)) for held in (False, True)}
+        g = {held: np.zeros((1, k)) for held in (False, True)}
+        for piece, own in zip(self.pieces, columns, strict=True):
+            j = np.hstack([piece.parameters, own])
+            h[piece.held] += j.T @ j
+            g[piece.held] += j.T @ piece.missed
+        return h, g
+
+    def _errors(self, sums: tuple[Fold, Fold], tolerances: np.ndarray) -> np.ndarray:
+        """What each side leaves of the other, chi2 per sample, shape (batch,).
+
+        Args:
+            sums: Normal equations, (1 or batch, k, k) and (1 or batch, k).
+            tolerances: Of the coefficients, shape (1 or batch, coefficients).
+        """
+        h, g = sums
+        batch = max(len(tolerances), len(g[False]))
+        precision = np.empty((batch, g[False].shape[1]))
+        precision[:, : len(self.precision)] = self.precision
+        precision[:, len(self.precision) :] = tolerances**-2.0
+        pull = np.zeros_like(precision)
+        pull[:, : len(self.precision)] = self.precision * self.centre
+        total = np.zeros(batch)
+        for learn in (False, True):
+            x = np.zeros_like(pull)
+            for _ in range(3):
+                # The weight of the data follows what is left, as in the identification.
+                left = self._left(h, g, x, learn) / max(self.samples[learn], 1)
+                weight = weight_of(left, 1 / SAMPLES_HZ)
+                a = weight[:, None, None] * h[learn] + _diagonal(precision)
+                scale = np.sqrt(np.maximum(np.einsum('bii->bi', a), 1e-300))
+                a = a / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(a.shape[1])
+                b = (weight[:, None] * g[learn] + pull) / scale
+                x = np.linalg.solve(a, b[:, :, None])[..., 0] / scale
+            total += self._left(h, g, x, not learn)
+        return total / sum(self.samples.values())
+
+    def _solve(self, sums: tuple[Fold, Fold], tolerances: np.ndarray) -> np.ndarray:
+        """Parameters and coefficients from all pieces, shape (k,)."""
+        h, g = (part[False][0] + part[True][0] for part in sums)
+        precision = np.concatenate([self.precision, tolerances**-2.0])
+        pull = np.concatenate([self.precision * self.centre, np.zeros(len(tolerances))])
+        weight, samples = 1.0, sum(self.samples.values())
+        for _ in range(3):
+            a = weight * h + np.diag(precision)
+            scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+            b = (weight * g + pull) / scale
+            x = np.linalg.lstsq(a / np.outer(scale, scale), b, rcond=1e-12)[0] / scale
+            left = sum(self.squares.values()) + x @ h @ x - 2 * g @ x
+            weight = float(weight_of(left / samples, 1 / SAMPLES_HZ))
+        return x
+
+    def _left(self, h: Fold, g: Fold, x: np.ndarray, side: bool) -> np.ndarray:
+        curved = np.matmul(h[side], x[:, :, None])[..., 0]
+        return self.squares[side] + ((curved - 2 * g[side]) * x).sum(axis=1)
+
+
+def _diagonal(values: np.ndarray) -> np.ndarray:
+    return values[:, :, None] * np.eye(values.shape[1])

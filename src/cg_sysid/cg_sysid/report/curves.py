@@ -1,0 +1,159 @@
+"""Curves: measured and simulated signals record by record, as the report draws them.
+
+They lie beside the result as curves.npz, so that the report can be drawn again without bags,
+models or fits.
+"""
+
+import io
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.checks.faults import FaultSignal, as_arrays, from_arrays
+from cg_sysid.identification.data_set import Trial, sensor_matrix
+from cg_sysid.identification.identify import in_trial
+
+FILE_NAME = 'curves.npz'
+FORMAT = 'cg_curves/1'
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One record, measured and simulated.
+
+    Attributes:
+        name: Name of the record.
+        role: `train`, `held`, or `all` where nothing was held out.
+        time: In s from the first row, shape (n,).
+        inputs: Held inputs in N m, shape (n, nu).
+        measured: Outputs, NaN where there is no sample, shape (n, ny).
+        before: Simulated by the model before, shape (n, ny).
+        after: Simulated by the model after, shape (n, ny).
+        position: Angle that belongs to each output in rad, as simulated after, shape (n, ny).
+        rate: Its rate in rad/s, shape (n, ny).
+    """
+
+    name: str
+    role: str
+    time: np.ndarray
+    inputs: np.ndarray = field(repr=False)
+    measured: np.ndarray = field(repr=False)
+    before: np.ndarray = field(repr=False)
+    after: np.ndarray = field(repr=False)
+    position: np.ndarray = field(repr=False)
+    rate: np.ndarray = field(repr=False)
+
+
+SIGNALS = ('time', 'inputs', 'measured', 'before', 'after', 'position', 'rate')
+
+
+def make_curve(
+    trial: Trial,
+    role: str,
+    before: Model,
+    before_motion: np.ndarray,
+    after: Model,
+    after_motion: np.ndarray,
+) -> Curve:
+    """Simulate a trial with two models, each from its own fitted initial motion.
+
+    Args:
+        trial: The record.
+        role: `train`, `held` or `all`.
+        before: The model before.
+        before_motion: What the trial has of its own there (Fit.motions).
+        after: The model after.
+        after_motion: The same for the model after.
+    """
+    outputs, _ = _simulated(before, trial, before_motion)
+    better, states = _simulated(after, trial, after_motion)
+    matrix = sensor_matrix(after.mechanism, trial.setup)
+    m = matrix.shape[1] // 2
+    angle = np.array([row[:m] if np.any(row[:m]) else row[m:] for row in matrix])
+    return Curve(
+        name=trial.name,
+        role=role,
+        time=trial.time,
+        inputs=trial.inputs,
+        measured=trial.outputs,
+        before=outputs,
+        after=better,
+        position=states[:, :m] @ angle.T,
+        rate=states[:, m : 2 * m] @ angle.T,
+    )
+
+
+def _simulated(
+    model: Model, trial: Trial, motion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    model, motion = in_trial(model, motion)
+    compiled = compile_model(model, trial.setup)
+    p = parameter_vector(model, trial.setup)
+    u = trial.inputs_for(compiled.input_names)
+    states = compiled.simulate(trial.time, u, compiled.initial_state(motion, u[0], p), p)
+    return compiled.outputs(trial.time, u, states, p), states
+
+
+def save(
+    curves: Sequence[Curve], directory: str | Path, faults: Sequence[FaultSignal] = ()
+) -> Path:
+    """Write curves.npz, whole or not at all; plain arrays only."""
+    arrays: dict[str, Any] = {
+        'format': np.array(FORMAT),
+        'names': np.array([c.name for c in curves], dtype=np.str_),
+        'roles': np.array([c.role for c in curves], dtype=np.str_),
+        **as_arrays(faults),
+    }
+    for k, curve in enumerate(curves):
+        for signal in SIGNALS:
+            # Times keep all digits; the rest is for the eye.
+            kind = np.float64 if signal == 'time' else np.float32
+            arrays[f'{k}/{signal}'] = getattr(curve, signal).astype(kind)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    path = Path(directory) / FILE_NAME
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
+    try:
+        with os.fdopen(handle, 'wb') as file:
+            file.write(buffer.getvalue())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+    return path
+
+
+def load(directory: str | Path) -> tuple[list[Curve], list[FaultSignal]]:
+    """Read curves.npz; empty lists where there is none.
+
+    Raises:
+        ValueError: The file is not of this format.
+    """
+    path = Path(directory) / FILE_NAME
+    if not path.is_file():
+        return [], []
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            if str(arrays['format']) != FORMAT:
+                raise ValueError(f'format is {arrays["format"]}, expected {FORMAT}')
+            found = [
+                Curve(str(name), str(role), *(arrays[f'{k}/{signal}'] for signal in SIGNALS))
+                for k, (name, role) in enumerate(
+                    zip(arrays['names'], arrays['roles'], strict=True)
+                )
+            ]
+            return found, from_arrays(arrays)
+    except Exception as error:  # zipfile and zlib have their own kinds
+        raise ValueError(f'{path}: not a file of curves: {error}') from None

@@ -1,0 +1,1 @@
+"""The search for causes: candidates, screening, successive halving, model selection."""

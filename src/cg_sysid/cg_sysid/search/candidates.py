@@ -1,0 +1,678 @@
+"""One effect on top of a model: where it can act, where its fit sets out, and how well it does."""
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import CLOCKS, TIME
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
+from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
+from cg_sysid.search import screening as glimpse
+from cg_sysid.search.events import seek_events, undisturbed
+from cg_sysid.search.nuisance import Bounds, turning
+from cg_sysid.text import measured
+
+SCREEN_ITERATIONS = 16
+ITERATIONS = 60
+THOROUGH_ITERATIONS = 72  # of the last fit
+MOST_STARTS = 24
+FOLLOWED = 3  # starts that are worth a second look
+FOLLOWING = 8  # iterations of each, before the best of them is chosen
+SAME = 1.01  # ratio of the errors of two fits that may be one minimum
+ALIKE = 0.1  # relative difference of an effect's parameters there
+SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
+WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
+SETTLED = 1.2  # chi2/N at which nothing is left to find
+STRAINED = 4.0  # tolerances from which a number is not what the model file believes
+TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none at all
+SURE = 5.0  # standard deviations from which an event of a record is not chance
+
+Start = tuple[Model, Fit | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One candidate to fit: an effect (or None for the base alone) on top of a model.
+
+    Attributes:
+        model: The base.
+        effect: Effect and place.
+        events: What each trial has of its own, as far as the base knows it: name of the trial ->
+            full name -> value (unknowns.own_unknowns).
+        bounds: Small faults that the base may have (imperfections.py).
+        leads: Go on from the best of these fits, the most promising first; without any from
+            the effect's own starts.
+        iterations: Limit for whole records.
+        thorough: Fit whole records down to the very bottom (identify.fit).
+        base: Fit of the base. With an effect more it can only be better; where a fit from the
+            file's numbers is not, it goes on from there.
+        first: Fit of the base to a glimpse of the records, for looks in the same way.
+        reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
+    """
+
+    model: Model
+    effect: tuple[str, str | None] | None = None
+    events: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    bounds: Bounds = field(default_factory=dict)
+    leads: tuple[Fit, ...] = ()
+    iterations: int = ITERATIONS
+    thorough: bool = False
+    base: Fit | None = None
+    first: Fit | None = None
+    reach: float = np.inf
+
+
+@dataclass(frozen=True)
+class Look:
+    """A fit to a glimpse of the records: is a candidate worth a whole one?
+
+    Attributes:
+        label: Label of the effect.
+        task: What to go on with.
+        error: chi2/N of these seconds; NaN where they cannot tell.
+    """
+
+    label: str
+    task: Task
+    error: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What fitting a task gave: fits on both sets and the residuals over noise."""
+
+    task: Task
+    label: str
+    model: Model
+    train: Fit
+    held: Fit
+    residuals: tuple[np.ndarray, ...] = field(repr=False)
+    belief: float
+    unknowns: int
+    events: Mapping[str, Mapping[str, float]]
+    trials: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
+
+
+def candidates_for(
+    model: Model,
+    setups: Sequence[Setup],
+    names: Sequence[str] | None = None,
+    recorded: Collection[str] = (),
+    small: Collection[str] = (),
+) -> list[tuple[str, str | None]]:
+    """(effect, at) of all that could show in these set-ups and that the model does not have.
+
+    What the model has as a small fault (labels in `small`) can still be a cause, as a large one.
+    An effect that needs a switch (`drive_enabled`) is tried only where that was recorded: with
+    the switch always on it would be another name for a simpler effect.
+    """
+    known = {*model.mechanism.inputs, *CLOCKS, *recorded}
+    present = {effect.label for effect in model.effects}.difference(small)
+    found, asked = [], False
+    for name, effect in LIBRARY.items():
+        if not effect.applies(setups) or not known.issuperset(effect.extra_inputs):
+            continue
+        for at in effect.sites(model.mechanism):
+            made = effect(model.mechanism, at)
+            wanted = names is None or name in names or made.label in names
+            asked |= wanted
+            # Landings are judged by themselves, when all else is settled (landings.py).
+            if wanted and made.label not in present and effect.place != 'impact':
+                found.append((name, made.at))
+    if names is not None and not asked:
+        raise IdentificationError(
+            f'none of the effects {", ".join(names)} can be tried; the library has: '
+            f'{", ".join(LIBRARY)}'
+        )
+    return found
+
+
+def starts_of(name: str) -> list[dict[str, float]]:
+    """Values of an effect's parameters from which its identification sets out."""
+    grids = [
+        [(p.name, start) for start in p.starts] if p.choice or (p.free and not p.each)
+        else [(p.name, p.default if p.neutral is None else p.neutral)]
+        for p in LIBRARY[name].parameters
+    ]  # fmt: skip
+    return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
+
+
+def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
+    """Fit one candidate to a glimpse of the training trials, from each of its starts.
+
+    Returns:
+        The look, or a sentence saying why there is none.
+    """
+    label, task = _label(task), _as_cause(task)
+    late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
+    if eventful(task) or late or not glimpse.lengths(train):
+        return Look(label, task, np.nan)
+    try:
+        leads = _first_seconds(task, train)
+        if task.first is not None and leads[0].normalised_error > task.first.normalised_error:
+            model = next(_starting_models(task))
+            beyond = _look(task, model, train, start=started_from(task.first, model, task.bounds))
+            leads = tuple(sorted([beyond, *leads], key=lambda lead: lead.normalised_error))
+            leads = leads[:FOLLOWED]
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+    return Look(label, replace(task, leads=leads), leads[0].normalised_error)
+
+
+def led_on(look: Look, task: Task) -> Look:
+    """The look for a task that has other small faults beside the same effect."""
+    task = _as_cause(task)
+    model = next(_starting_models(task))
+    leads = tuple(started_from(lead, model, task.bounds) for lead in look.task.leads)
+    return replace(look, task=replace(task, leads=leads))
+
+
+def _as_cause(task: Task) -> Task:
+    """What is tried as a cause is not bound to be small, as the same small fault would be.
+
+    Only the shape of its law is bound, where small faults are allowed for.
+    """
+    if task.effect is None or not task.bounds:
+        return task
+    own = f'{_label(task)}.'
+    shapes = {f'{own}{p.name}': p.leeway for p in LIBRARY[task.effect[0]].parameters if p.leeway}
+    others = {n: b for n, b in task.bounds.items() if not n.startswith(own)}
+    return replace(task, bounds=others | shapes)
+
+
+def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
+    """Fit one candidate on the training trials and score it on the held-out ones.
+
+    Returns:
+        The outcome, or a sentence saying why there is none.
+    """
+    label, task = _label(task), _as_cause(task)
+    try:
+        best = _best_fit(task, train)
+        known: Mapping[str, Mapping[str, float]] = {
+            t.name: task.events[t.name] for t in held if t.name in task.events
+        }
+        if eventful(task):
+            known = seek_events(best.model, held, label, known, _surest(best, label))
+        unseen = _unseen_shapes(best)
+        held_score = score(
+            best.model, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
+            task.thorough, task.reach,
+        )  # fmt: skip
+        events = best.own_by_name(train) | held_score.own_by_name(held)
+        model = believing(best.model, task.model, label)
+        residuals = tuple(
+            (predict(found.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
+            for found, trials in ((best, train), (held_score, held))
+            for trial, motion in zip(trials, found.motions, strict=True)
+        )
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+    return Outcome(
+        task, label, model, best, held_score, residuals,
+        best.belief + best.starts + held_score.starts,
+        # Small faults cost nothing: every robot has them.
+        shared_unknowns(best, task.bounds) + _own_count(best, (*train, *held)), events,
+        (tuple(t.name for t in train), tuple(t.name for t in held)),
+    )  # fmt: skip
+
+
+def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
+    """A thorough fit of an outcome's structure to all records, those held out among them.
+
+    Rivals that have earned their place on held-out records are told apart by this: values that
+    were fitted to one half miss the other by chance, and by more than rivals may differ.
+
+    Args:
+        o: The outcome to go on from.
+        trials: Those of its training, then those held out.
+    """
+    both = replace(o.train, motions=(*o.train.motions, *o.held.motions))
+    start = started_from(both, o.model, o.task.bounds)
+    try:
+        return fit(o.model, trials, start=start, own=o.events, bounds=o.task.bounds, thorough=True,
+                   iterations=THOROUGH_ITERATIONS)  # fmt: skip
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
+        return str(error)
+
+
+def shared_unknowns(found: Fit, bounds: Bounds) -> int:
+    """Number of values that all trials of a fit share, less small faults."""
+    return sum(u.name not in bounds for u in found.unknowns)
+
+
+def _own_count(found: Fit, trials: Sequence[Trial]) -> int:
+    """Values that these trials have of their own beyond their initial motions."""
+    several = {'record': len(trials), 'recording': len({trial.recording for trial in trials})}
+    return sum(several[u.each] for u in found.own)
+
+
+def _surest(found: Fit, label: str) -> list[np.ndarray]:
+    """An effect's own values in the trials in which something surely happened."""
+    count = len(found.own)
+    place = [k for k, u in enumerate(found.own) if u.name.startswith(f'{label}.')]
+    own = [motion[len(motion) - count :][place] for motion in found.motions]
+    sure = [
+        abs(values[0]) / max(sigmas[place[0]], 1e-300)
+        for values, sigmas in zip(own, found.own_sigmas, strict=True)
+    ]
+    order = sorted(range(len(own)), key=lambda i: -sure[i])
+    return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
+
+
+def _unseen_shapes(found: Fit) -> tuple[str, ...]:
+    """Shapes of events of which no record of a fit had one: only other records can tell."""
+    return tuple(
+        u.name for effect in found.model.effects for u in found.unknowns
+        if effect.name in LIBRARY and any(p.each == 'record' for p in effect.parameters)
+        and u.name.startswith(f'{effect.label}.') and not _surest(found, effect.label)
+    )  # fmt: skip
+
+
+def cost_of(task: Task) -> int:
+    """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
+    name = _label(task).partition('@')[0]
+    kind = LIBRARY[name]
+    events = any(p.each == 'record' for p in kind.parameters)
+    swept = any(p.swept for p in kind.parameters)
+    return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(name))
+
+
+def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    if eventful(task):
+        return _event_fit(task, train)
+    best = _own_fit(task, train)
+    if task.base is None or best.normalised_error <= task.base.normalised_error:
+        return best
+    model = next(_starting_models(task))
+    start = started_from(task.base, model, task.bounds)
+    again = _whole(task, model, train, start, task.iterations)
+    return min(best, again, key=lambda found: found.normalised_error)
+
+
+def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
+    """A fit as a start for a model of other effects; what it has not is where the model says."""
+    known = {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)}
+    unknowns = unknowns_of(model, bounds=bounds)
+    own = own_unknowns(model)
+    before = unsettled_states(found.model)
+    motions = []
+    for motion in found.motions:
+        first = len(motion) - len(found.own)
+        known_own = {u.name: v for u, v in zip(found.own, motion[first:], strict=True)}
+        moving = first - len(before)
+        away = dict(zip(before, motion[moving:first], strict=True))
+        motions.append(
+            np.array([
+                *motion[:moving],
+                *(away.get(state, 0.0) for state in unsettled_states(model)),
+                *(known_own.get(u.name, u.prior) for u in own),
+            ])
+        )  # fmt: skip
+    values = np.array([np.clip(known.get(u.name, u.prior), u.lower, u.upper) for u in unknowns])
+    return replace(
+        found, model=_chosen(model, found), unknowns=unknowns, values=values, own=own,
+        motions=tuple(motions),
+    )  # fmt: skip
+
+
+def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    model, leads = next(_starting_models(task)), task.leads
+    if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
+        leads = _first_seconds(task, train)
+    if not leads:
+        return _whole(task, model, train, None, task.iterations)
+    # The first seconds may mislead where the error has many minima: a resonance that is not
+    # excited yet, a gap that is passed once.
+    best = _whole(task, _chosen(model, leads[0]), train, leads[0], FOLLOWING)
+    for lead in leads[1:]:
+        if best.normalised_error < SETTLED or lead.normalised_error > task.reach:
+            break
+        other = _whole(task, _chosen(model, lead), train, lead, FOLLOWING)
+        best = min(best, other, key=lambda found: found.normalised_error)
+    left = task.iterations - FOLLOWING
+    if best.converged or left < 1:
+        return best
+    return _whole(task, _chosen(model, best), train, best, left)
+
+
+def _chosen(model: Model, lead: Fit) -> Model:
+    """The model with the choices that a lead has made for the last of its effects."""
+    stated = lead.model.values
+    names = [f'{e.label}.{p.name}' for e in model.effects[-1:] for p in e.parameters if p.choice]
+    return model.with_values({name: stated[name] for name in names if name in stated})
+
+
+def _whole(
+    task: Task, model: Model, train: Sequence[Trial], start: Fit | None, iterations: int
+) -> Fit:
+    """Fit whole records, all of them."""
+    start = glimpse.to_all(start, train) if start else None
+    return fit(
+        model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
+        thorough=task.thorough, reach=task.reach,
+    )  # fmt: skip
+
+
+def eventful(task: Task) -> bool:
+    """Whether the effect is one of which every record has its own."""
+    if task.effect is None:
+        return False
+    return any(p.each == 'record' for p in LIBRARY[task.effect[0]].parameters)
+
+
+def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
+    """Fits to a glimpse from every start: the best, and others that differ from it.
+
+    From the task's leads, where it has some: looks at the same beside other small faults.
+    """
+    models = list(_starting_models(task))
+    starts: list[Start] = [(model, None) for model in models]
+    if task.leads:
+        starts = [(_chosen(models[0], lead), lead) for lead in task.leads]
+    kept = _swept(models[0]) if not task.leads else []
+    looks = _looks(task, starts, train, kept)
+    if kept:
+        # Let go of the frequency only where a fit at its start is promising.
+        looks = _looks(task, [(model, None) for _, model in looks[:FOLLOWED]], train, [])
+    leads: list[Fit] = []
+    for look, model in looks:
+        if not any(one_minimum(look, lead, model.effects[-1].label) for lead in leads):
+            leads.append(look)
+    return tuple(leads[:FOLLOWED])
+
+
+def one_minimum(a: Fit, b: Fit, label: str) -> bool:
+    """Whether two fits of an effect ended alike, or will."""
+    own, other = (
+        {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)
+         if u.name.startswith(f'{label}.')}
+        for found in (a, b)
+    )  # fmt: skip
+    near = a.normalised_error < SAME * b.normalised_error
+    alike = np.allclose(list(own.values()), [other.get(n, np.nan) for n in own], rtol=ALIKE)
+    return near and bool(alike)
+
+
+def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
+    """An effect of which every record has its own size and instant."""
+    best = task.leads[0] if task.leads else None
+    settled = best or fit(task.model, train, own=task.events, bounds=task.bounds)
+    nothing = settled.normalised_error
+    settled = best or undisturbed(task.model, train, task.bounds) or settled
+    for _ in range(SEEKINGS if best else 1):
+        # What was a push is at first taken for other parameters: seek again when it is not.
+        at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
+        model = next(_starting_models(task))
+        events = seek_events(model.with_values(at), train, _label(task), task.events)
+        settled = fit(
+            model, train, at=at, own=events, bounds=task.bounds, iterations=task.iterations
+        )
+        if best is None or settled.normalised_error < best.normalised_error:
+            best = settled
+        if best.normalised_error < SETTLED:
+            return fit(model, train, start=best, bounds=task.bounds)
+    assert best is not None
+    found = bool(task.leads) or best.normalised_error > WORTH_SEEKING * nothing
+    return replace(best, converged=found)
+
+
+def _look(
+    task: Task,
+    model: Model,
+    train: Sequence[Trial],
+    only: Sequence[str] | None = None,
+    start: Fit | None = None,
+    length: float = glimpse.LENGTHS_S[0],
+) -> Fit:
+    """A fit to a glimpse of the records: as long as the base's own look, if there is one."""
+    few = [train[i] for i in glimpse.few(train)]
+    return fit(
+        model, few, only, horizon=task.first.horizon if task.first else length,
+        iterations=SCREEN_ITERATIONS, start=start,
+        own=task.events, bounds=task.bounds, reach=task.reach, sure=False,
+    )  # fmt: skip
+
+
+def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
+    """Fit of a task's base to a glimpse, from its fit to whole records; None without.
+
+    To so many seconds that something is wrong there: where nothing is, nothing can help.
+    """
+    found = None
+    start = glimpse.to_few(task.base, train) if task.base else None
+    for length in glimpse.lengths(train):
+        try:
+            found = _look(task, task.model, train, start=start, length=length)
+        except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+            break
+        if found.normalised_error > SETTLED:
+            break
+    return found
+
+
+def deeper(task: Task, lead: Fit, train: Sequence[Trial]) -> Fit | None:
+    """Fit of a task's base to a glimpse from where an effect more has led its numbers.
+
+    Returns:
+        The fit, if it lies clearly deeper than the base's own; None otherwise.
+    """
+    assert task.first is not None
+    start = started_from(lead, task.model, task.bounds)
+    try:
+        found = _look(task, task.model, train, start=start)
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return None
+    return found if SAME * found.normalised_error < task.first.normalised_error else None
+
+
+def _swept(model: Model) -> list[str]:
+    # Of the effect that is being tried: those before it stay about where they were found.
+    own = model.effects[-1]
+    return [f'{own.label}.{p.name}' for p in own.parameters if p.swept]
+
+
+def _looks(
+    task: Task, starts: Sequence[Start], train: Sequence[Trial], kept: Sequence[str]
+) -> list[tuple[Fit, Model]]:
+    """Short fits from each start and where they lead, best first; `kept` stay as they are."""
+    looks = []
+    for model, start in starts:
+        moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
+        only = [name for name in moved if name not in kept] if kept else None
+        try:
+            look = _look(task, model, train, only, start)
+            found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
+            looks.append((look, model.with_values(found)))
+        except IdentificationError as error:
+            failure = error
+    if not looks:
+        raise failure
+    return sorted(looks, key=lambda pair: pair[0].normalised_error)
+
+
+def _starting_models(task: Task):
+    if task.effect is None:
+        yield task.model
+        return
+    name, at = task.effect
+    label = _label(task)
+    small = any(effect.label == label for effect in task.model.effects)
+    base = task.model.without_effect(label) if small else task.model
+    for start in starts_of(name):
+        yield base.with_effect(name, at, **start | turning(base, name, at))
+
+
+def _label(task: Task) -> str:
+    if task.effect is None:
+        return task.model.name
+    name, at = task.effect
+    return LIBRARY[name](task.model.mechanism, at).label
+
+
+def believing(fitted: Model, base: Model, label: str) -> Model:
+    """The fitted structure with the base's numbers and beliefs; added effects keep their values.
+
+    What a fit found is a start for the next one, not a belief.
+    """
+    added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
+             if n not in base.quantities or n.startswith(f'{label}.')}
+    return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
+
+
+def chi2(o: Outcome) -> float:
+    """Squared error over noise variance, training and held-out trials together."""
+    return o.train.squares + o.held.squares
+
+
+def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]:
+    """Identified parameters of one effect: name -> (value, standard deviation, unit).
+
+    And a choice, where it is not the usual one, as something known for certain.
+
+    Of what every record has of its own, that of the record where it is surest: of those that were
+    fitted, if it happened in one, as held-out records take the model's own numbers for certain.
+    """
+    prefix = f'{label}.'
+    shared = shared_parameters(o.train, label)
+    own = next((e.parameters for e in o.model.effects if e.label == label), ())
+    for p in own:
+        chosen = o.model.values[f'{prefix}{p.name}']
+        if p.choice and p.name not in shared and chosen != p.starts[0]:
+            shared[p.name] = chosen, 0.0, p.unit
+    events = events_of(o, label)
+    fitted = [events[name] for name in o.trials[0] if name in events]
+    surest = max(fitted or events.values(), key=_sureness, default={})
+    return {**surest, **shared}
+
+
+def shared_parameters(found: Fit, label: str) -> dict[str, tuple[float, float, str]]:
+    """Those parameters of an effect that all records share: name -> (value, sigma, unit)."""
+    prefix = f'{label}.'
+    return {
+        u.name.removeprefix(prefix): (float(v), float(s), u.unit)
+        for u, v, s in zip(found.unknowns, found.values, found.sigmas, strict=True)
+        if u.name.startswith(prefix)
+    }
+
+
+def events_of(o: Outcome, label: str) -> dict[str, dict[str, tuple[float, float, str]]]:
+    """What surely happened in single records: record -> own parameter -> (value, sigma, unit).
+
+    The intervals of held-out records take the shared numbers for certain; `events_in` of a fit to
+    all records (fit_to_all) does not.
+    """
+    train, held = o.trials
+    return {**events_in(o.train, train, label), **events_in(o.held, held, label)}
+
+
+def events_in(
+    found: Fit, names: Sequence[str], label: str
+) -> dict[str, dict[str, tuple[float, float, str]]]:
+    """What surely happened, by one fit to the records of these names; as `events_of`."""
+    events = {}
+    for name, motion, sigmas in zip(names, found.motions, found.own_sigmas, strict=True):
+        values = motion[len(motion) - len(found.own) :]
+        row = {
+            u.name.removeprefix(f'{label}.'): (float(v), float(s), u.unit)
+            for u, v, s in zip(found.own, values, sigmas, strict=True)
+            if u.name.startswith(f'{label}.')
+        }
+        if row and _sureness(row) > SURE:
+            events[name] = row
+    return events
+
+
+def _sureness(event: Mapping[str, tuple[float, float, str]]) -> float:
+    size, sigma, _ = next(iter(event.values()))
+    return abs(size) / max(sigma, 1e-300)
+
+
+def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
+    """Parameters of the effect tried: name -> (value, standard deviation, unit)."""
+    return parameters_of(o, o.label)
+
+
+def strained(o: Outcome) -> dict[str, float]:
+    """Parameters that the fit puts far from what the file believes: tolerances away."""
+    away = {
+        u.name: abs(u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance
+        for u, v in zip(o.train.unknowns, o.train.values, strict=True)
+        if np.isfinite(u.tolerance) and u.name not in o.task.bounds
+    }
+    return {name: tolerances for name, tolerances in away.items() if tolerances > STRAINED}
+
+
+def too_small(o: Outcome) -> list[str]:
+    """An effect whose size is as good as none is not what helped."""
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    if kind is None:
+        return []
+    first = kind.parameters[0]
+    if first.neutral is None or not np.isfinite(first.neutral) or first.each:
+        return []
+    value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
+    # Within their bounds small faults may take any part of it: that says nothing of its size.
+    beside = _sigma_beside(o.train, f'{o.label}.{first.name}', o.task.bounds)
+    if abs(value - first.neutral) > TOO_SMALL * min(sigma, beside):
+        return []
+    return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
+
+
+def undetermined_size(o: Outcome) -> list[str]:
+    """An effect of whose size not even the order is known is not what helped.
+
+    A limit that was never reached, a stiffness that nothing bends: what acts is something else.
+    """
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    if kind is None or f'{o.label}.{kind.parameters[0].name}' not in o.train.undetermined:
+        return []
+    name = kind.parameters[0].name
+    return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
+
+
+def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
+    """Standard deviation of a value, were the values of these names known."""
+    names = [u.name for u in found.unknowns]
+    if name not in names:
+        return np.inf
+    at, known = names.index(name), [names.index(n) for n in given if n in names]
+    among, across = found.covariance[np.ix_(known, known)], found.covariance[at, known]
+    if not known or not np.isfinite(among).all() or not np.isfinite(across).all():
+        return float(found.sigmas[at])
+    variance = found.covariance[at, at] - across @ np.linalg.pinv(among) @ across
+    factor = abs(found.values[at]) if found.unknowns[at].logarithmic else 1.0
+    return factor * float(np.sqrt(max(variance, 0.0)))
+
+
+def at_edge(o: Outcome) -> list[str]:
+    """A parameter at the edge of its range says that the effect is not what is meant.
+
+    But for a part of an effect that may well be absent: the edge is where it vanishes; and for a
+    share, which may be none or all.
+    """
+    found = []
+    kind = LIBRARY.get(o.label.partition('@')[0])
+    optional = {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower
+                } if kind else set()
+    shares = {f'{o.label}.{p.name}' for p in kind.parameters if p.bounded} if kind else set()
+    for u, v in zip(o.train.unknowns, o.train.values, strict=True):
+        if u.name in {*o.task.bounds, *shares} or not u.name.startswith(f'{o.label}.'):
+            continue
+        low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
+                         for x in (u.lower, u.upper, v))
+        # Ranges suit machines of all sizes: a small value is not yet an edge.
+        margin = 1e-3 * (high - low)
+        if not u.logarithmic:
+            margin = min(margin, 0.1 * u.scale)
+        below = np.inf if u.name in optional else at - low
+        if min(below, high - at) < margin:
+            found.append(f'{u.name} = {measured(v, None, u.unit)} lies at the edge of its range')
+    return found

@@ -1,0 +1,197 @@
+"""When did it happen, and how much: first guesses of what one record has of its own.
+
+An event such as a push shows from its instant on. For every instant of a grid, the size of a
+small event there that would lower the simulation error most, and by how much, is a linear
+question: one sensitivity. Where the answer peaks, a fit of that record alone goes on from.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.effects.effect import TIME
+from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.identification.data_set import Trial, pieces
+from cg_sysid.identification.identify import Fit, fit, in_trial, score
+from cg_sysid.identification.unknowns import IdentificationError, awake, own_unknowns
+from cg_sysid.search.nuisance import Bounds
+
+GRID_S = 0.2
+PIECE_S = 2.0  # of a record, in most of which nothing happens
+KEPT = 0.5  # share of the pieces that is kept at least
+QUIET = 1.2  # chi2/N of pieces that are all kept
+TRIMMINGS = 3  # times that a fit chooses its pieces
+PIECE_ITERATIONS = 8
+BEFORE_S = 0.5  # of a spoilt piece: what happened may have begun there
+FOLLOWED = 3  # peaks from which a fit goes on
+
+
+def seek_events(
+    model: Model, trials: Sequence[Trial], label: str,
+    known: Mapping[str, Mapping[str, float]] | None = None,
+    elsewhere: Sequence[np.ndarray] = (),
+) -> dict[str, dict[str, float]]:
+    """Trial name -> full name -> guess of its own value.
+
+    Args:
+        model: Has an effect of which every record has a size and an instant; its other values
+            are taken as they are.
+        trials: Each is looked at by itself.
+        label: Of the effect.
+        known: What else each trial has of its own, and as far as it is known this.
+        elsewhere: Sizes and instants in other trials; they may be those of these as well.
+    """
+    names = [u.name for u in own_unknowns(model) if u.name.startswith(f'{label}.')]
+    known = known or {}
+    if trials and all(set(names) <= set(known.get(trial.name, ())) for trial in trials):
+        return {trial.name: dict(known[trial.name]) for trial in trials}
+    seeking = _Seeking(model, names, known)
+    guesses = [seeking.alone(trial) for trial in trials]
+    # What happened in one record may have happened at the same time in another.
+    surest = sorted(guesses, key=lambda g: g.error / g.quiet)[:FOLLOWED]
+    others = [*elsewhere, *(g.event for g in surest if g.error < g.quiet)]
+    guesses = [seeking.follow(t, g, others) for t, g in zip(trials, guesses, strict=True)]
+    return {
+        trial.name: seeking.beside(trial, guess.event)
+        for trial, guess in zip(trials, guesses, strict=True)
+    }
+
+
+def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | None:
+    """Fit of a model to those pieces of the records in which nothing happens.
+
+    An event that the model does not have pulls at all its numbers, and with such numbers it is
+    not found. It spoils few pieces: the others are those that can be simulated (least trimmed
+    squares).
+
+    Returns:
+        None where that makes no sense: many pieces cannot be simulated down to the noise
+        (something is wrong all the time), or all can.
+    """
+    # Pieces would have to share what belongs to a record; and a drift is told by late pieces,
+    # which a first, spoilt fit loses.
+    if own_unknowns(model) or any(TIME in effect.extra_inputs for effect in model.effects):
+        return None
+    whole = [piece for t in trials for _, piece in pieces(model.mechanism, t, PIECE_S)]
+    kept, found = whole, None
+    try:
+        for _ in range(TRIMMINGS):
+            found = fit(model, kept, bounds=bounds, iterations=PIECE_ITERATIONS)
+            errors = _piece_errors(found.model, whole)
+            quiet = max(QUIET, float(np.quantile(errors, KEPT, method='lower')))
+            kept = [piece for piece, e in zip(whole, errors, strict=True) if e <= quiet]
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return None
+    spoilt = len(whole) - len(kept)
+    return found if spoilt and quiet == QUIET else None
+
+
+def _piece_errors(model: Model, found: Sequence[Trial]) -> np.ndarray:
+    """chi2/N of each piece."""
+    fitted = score(model, found)
+    return np.nansum(fitted.mse * fitted.count, axis=1) / fitted.count.sum(axis=1)
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """Size and instant in a trial, and its error (chi2/N) with the event and without."""
+
+    event: np.ndarray
+    error: float
+    quiet: float
+
+
+@dataclass(frozen=True)
+class _Seeking:
+    """A search of single trials for size and instant, beside what else is known of each."""
+
+    model: Model
+    names: Sequence[str]
+    known: Mapping[str, Mapping[str, float]]
+
+    def beside(self, trial: Trial, event: np.ndarray) -> dict[str, float]:
+        """All that the trial has of its own, by name."""
+        named = dict(zip(self.names, map(float, event), strict=True))
+        return {**self.known.get(trial.name, {}), **named}
+
+    def alone(self, trial: Trial) -> _Guess:
+        """The best that this trial alone knows."""
+        nothing = np.array([0.0, self.model.values[self.names[1]]])
+        quiet = self._fit(trial, nothing, 8)
+        guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
+        found = quiet.own_by_name([trial])[trial.name]
+        _, motion = in_trial(awake(self.model), quiet.motions[0])
+        others = {name: value for name, value in found.items() if name not in self.names}
+        starts = _small_events(self.model.with_values(others), trial, motion, self.names)
+        return self.follow(trial, guess, starts)
+
+    def follow(self, trial: Trial, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
+        """The best of a guess and the fits of this trial alone from each start."""
+        for start in starts:
+            try:
+                found = self._fit(trial, start, 16)
+            except IdentificationError:
+                continue
+            own = found.own_by_name([trial])[trial.name]
+            event = np.array([own[name] for name in self.names])
+            inside = 0.0 <= event[1] - trial.since <= trial.duration
+            if inside and found.normalised_error < guess.error:
+                guess = replace(guess, event=event, error=found.normalised_error)
+        return guess
+
+    def _fit(self, trial: Trial, event: np.ndarray, iterations: int) -> Fit:
+        own = {trial.name: self.beside(trial, event)}
+        return fit(self.model, [trial], only=(), own=own, iterations=iterations)
+
+
+def _small_events(
+    model: Model, trial: Trial, motion: np.ndarray, names: Sequence[str]
+) -> list[np.ndarray]:
+    """Sizes and instants of the events that lower the error most, best first."""
+    compiled = compile_model(awake(model), trial.setup)
+    size, instant = (compiled.parameter_names.index(name) for name in names)
+    p = parameter_vector(model, trial.setup)
+    p[size] = 0.0
+    u = trial.inputs_for(compiled.input_names)
+    m2 = len(motion)
+    x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
+    s0 = np.column_stack([by_motion, np.zeros(compiled.nx)])
+    column = np.where(np.array(compiled.free) == names[0], m2, -1)
+    grid = _instants(model.with_values({names[0]: 0.0}), trial)
+    gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
+    for k, t in enumerate(grid):
+        p[instant] = trial.since + t
+        normal, _, _ = compiled.normal(
+            trial.time, u, x0, s0, p, column, trial.outputs, 1 / trial.sigma
+        )
+        h, g = normal.hessian, normal.gradient
+        # What the initial motion could do as well does not count.
+        own_h = h[m2, m2] - h[m2, :m2] @ np.linalg.lstsq(h[:m2, :m2], h[:m2, m2], rcond=None)[0]
+        own_g = g[m2] - h[m2, :m2] @ np.linalg.lstsq(h[:m2, :m2], g[:m2], rcond=None)[0]
+        if own_h > 1e-9 * h[m2, m2]:
+            gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
+    peaks, _ = scipy.signal.find_peaks(np.concatenate([[0.0], gains, [0.0]]))
+    order = sorted(peaks - 1, key=lambda k: -gains[k])
+    return [np.array([sizes[k], trial.since + grid[k]]) for k in order[:FOLLOWED]]
+
+
+def _instants(model: Model, trial: Trial) -> np.ndarray:
+    """Instants in s from the first row, at which something may have happened.
+
+    All, or those about spoilt pieces.
+    """
+    grid = np.arange(0.0, trial.duration, GRID_S)
+    found = pieces(model.mechanism, trial, PIECE_S)
+    try:
+        errors = _piece_errors(model, [piece for _, piece in found])
+    except IdentificationError:
+        return grid  # too short for pieces, or none can be simulated
+    bad = errors > QUIET * max(1.0, float(np.median(errors)))
+    spoilt = np.array([begin for begin, _ in found])[bad]
+    near = (grid[:, None] > spoilt - BEFORE_S) & (grid[:, None] < spoilt + PIECE_S)
+    return grid[near.any(axis=1)] if len(spoilt) else grid

@@ -1,0 +1,311 @@
+"""Is an effect earned? The judgement of candidates against the model that they extend.
+
+The conditions and why they are what they are: docs/diagnosis.md, section 4.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
+from cg_sysid.search.candidates import (
+    Outcome,
+    at_edge,
+    chi2,
+    own_parameters,
+    shared_unknowns,
+    strained,
+    too_small,
+    undetermined_size,
+)
+from cg_sysid.search.nuisance import as_sound_robots, faults_among
+from cg_sysid.search.ranking import MARGIN, Candidate, contains, per_output
+
+# Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
+# so: it is the order of what integrators and interpolation differ by.
+FIDELITY = 1.5e-3
+# The same for thorough fits to all records: their late torques change at their own instants, and
+# half their steps move chi2 by no more than 1e-6 of it.
+THOROUGH_FIDELITY = 1e-4
+# Those that may be rivals and are fitted thoroughly: a late torque that changes between rows, and
+# readings that are late instead, differ by so much before.
+COARSE_FIDELITY = 2e-2
+# A model that leaves more than white noise has something wrong, and small differences say less.
+ROUGH_FIDELITY = 2e-3
+WHITE = 0.9  # share of independent samples from which a residual counts as white noise
+EARNED = 10.0  # nats an effect must gain over the model without it
+MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
+QUIETEST = 0.9  # chi2/N of an output of which nothing is wrong, at least
+HALF_SEEN = 0.3  # of what has to be explained on held-out records, at least on those fitted to
+AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
+SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
+FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
+SHORTEST_BLOCK_S = 0.1
+ACCOUNTS = 0.5  # of the squared error above the noise: who takes less does not explain it
+MISHAP = 1 / 3  # of the error above the noise: what single mishaps leave at most, if they are it
+SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
+BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
+
+
+@dataclass(frozen=True)
+class Contest:
+    """All candidates on top of one base, judged, best first.
+
+    Attributes:
+        base: What they extend.
+        ranked: Each candidate and the outcome of its fit.
+        independent: Independent samples behind the evidence.
+        margin: Evidence in nats by which rivals are not told apart.
+        aside: Labels of those that a first look set aside.
+    """
+
+    base: Outcome
+    ranked: tuple[tuple[Candidate, Outcome], ...]
+    independent: float
+    margin: float
+    aside: tuple[str, ...] = ()
+
+    def winner(self) -> tuple[Candidate, Outcome] | None:
+        """The best candidate that is earned, or a simpler one that it contains."""
+        able = [pair for pair in self.ranked if not pair[0].reason]
+        if not able:
+            return None
+        leader = able[0][0]
+        simpler = [
+            pair
+            for pair in able
+            if contains(leader.label, pair[0].label)
+            and pair[0].evidence > leader.evidence - self.margin
+        ]
+        return simpler[0] if simpler else able[0]
+
+    def less(self, label: str, reason: str) -> 'Contest':
+        """The contest with the candidate of that label turned down after all."""
+        return replace(self, ranked=tuple(
+            (replace(c, reason=reason) if c.label == label else c, o) for c, o in self.ranked
+        ))  # fmt: skip
+
+    def of(self, label: str) -> tuple[Candidate, Outcome] | None:
+        """The candidate of that label."""
+        return next((pair for pair in self.ranked if pair[0].label == label), None)
+
+    def close_to(self, label: str, fidelity: float = 0.0) -> list[Candidate]:
+        """Other earned candidates that come within the margin of this one, best first.
+
+        Args:
+            label: Of this one.
+            fidelity: Share of chi2/N by which they may differ besides.
+        """
+        found = self.of(label)
+        if found is None:
+            return []
+        least = found[0].evidence - max(self.margin, fidelity * self.independent / 2)
+        return [
+            c for c, _ in self.ranked if c.label != label and not c.reason and c.evidence > least
+        ]
+
+
+class Jury:
+    """Judges outcomes that were fitted on one split of records."""
+
+    def __init__(self, train: Sequence[Trial], held: Sequence[Trial]):
+        trials = (*train, *held)
+        self.first_held = len(train)
+        self.trials = trials
+        self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
+        judged = sum(trial.duration for trial in held)
+        block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
+        self.rows_per_block = max(1, int(block / np.median(self.steps)))
+
+    def contest(
+        self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | str] = ()
+    ) -> Contest:
+        """Rank outcomes that extend a base.
+
+        Args:
+            base: What they extend.
+            outcomes: To be ranked.
+            to_all: Where all outcomes are thorough fits: of each the fit to all records, or why
+                there is none. If all went through they rank the outcomes.
+        """
+        if not outcomes:
+            return Contest(base, (), 2.0, MARGIN)
+        leader = min([base, *outcomes], key=chi2)
+        independent = independent_samples(leader.residuals, self.steps)
+        reference = _evidence(base, independent)
+        joint = [f for f in to_all if isinstance(f, Fit)]
+        if len(joint) < len(outcomes):
+            found = [_evidence(o, independent) for o in outcomes]
+        else:
+            found = [
+                evidence(f.squares, samples(o), independent, o.unknowns, f.belief + f.starts)
+                for f, o in zip(joint, outcomes, strict=True)
+            ]
+        ranked = [
+            (self.judge(base, o, reference - own, independent), o)
+            for own, o in zip(found, outcomes, strict=True)
+        ]
+        ranked.sort(key=lambda pair: -pair[0].evidence)
+        white = independent > WHITE * samples(leader)
+        fine = THOROUGH_FIDELITY if to_all else FIDELITY
+        fidelity = fine if white else ROUGH_FIDELITY
+        margin = max(MARGIN, fidelity * independent / 2)
+        if at_noise(base) and not self.imitated(base):
+            # Beliefs decide, and those are rough: whatever relieves them is a rival.
+            margin = float('inf')
+        return Contest(base, tuple(ranked), independent, margin)
+
+    def judge(
+        self, base: Outcome, o: Outcome, gained: float, independent: float = float('inf')
+    ) -> Candidate:
+        """One outcome against its base, `gained` nats of evidence better."""
+        n = self.first_held
+        significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
+        explained = explained_by(base, o)
+        held_gain = 1 - o.held.normalised_error / base.held.normalised_error
+        reasons = []
+        if gained < EARNED:
+            reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
+        imitated = self.imitated(base)
+        if at_noise(base) and not imitated:
+            # No error is left to explain, but numbers that nobody believes.
+            if strained(o) or not at_noise(o):
+                reasons.append('leaves numbers far from what the model file believes')
+        elif significance < SIGNIFICANT or held_gain <= 0:
+            reasons.append('no significant gain on held-out records')
+        elif (
+            explained < MATERIAL
+            and not (strained(base) and not strained(o))
+            and not (imitated and self._white(o))
+        ):
+            reasons.append(f'explains {explained:.2f} noise standard deviations, '
+                           f'{MATERIAL:g} needed')
+        each = _own_values(o) / len(self.steps)
+        eventful = any(u.each == 'record' for u in o.train.own)
+        if eventful and independent < SAYS_MORE * each * len(self.steps):
+            # With a push of its own a short record is matched whatever is wrong, held out or not.
+            reasons.append(
+                f'records of {independent / len(self.steps):.0f} independent samples cannot '
+                f'judge {each:.0f} values of each record\'s own'
+            )
+        left = above_noise(o) / max(above_noise(base), 1e-300)
+        if eventful and not at_noise(o) and left > MISHAP:
+            # A push in every record takes the edge off whatever is wrong all the time.
+            reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
+                           f'{100 * MISHAP:.0f} % allowed')
+        own = own_parameters(o)
+        reasons += at_edge(o)
+        # What takes most of the error acts, though its numbers may be known together only.
+        if at_noise(base) or left > 1 - ACCOUNTS or not _known_at_all(o):
+            reasons += too_small(o) + undetermined_size(o)
+        reasons += as_sound_robots(o.label, own)
+        reasons += self._implausible(o)
+        return Candidate(
+            label=o.label,
+            model=o.train.model,
+            train=o.train,
+            held=o.held,
+            evidence=float(gained),
+            held_gain=float(held_gain),
+            significance=significance,
+            explained=explained,
+            parameters=own,
+            reason='; '.join(reasons),
+        )
+
+    def _implausible(self, o: Outcome) -> list[str]:
+        """That an effect's values are none of what it is named after."""
+        effect = next((e for e in o.model.effects if e.label == o.label), None)
+        if effect is None or effect.slides(o.model.mechanism):
+            return []
+        prefix = f'{o.label}.'
+        values = {n.removeprefix(prefix): v for n, v in o.train.model.values.items()
+                  if n.startswith(prefix)}  # fmt: skip
+        commands = o.model.mechanism.inputs
+        torque = max(float(np.abs(t.inputs_for(commands)).max()) for t in self.trials)
+        reason = effect.implausible(values, torque)
+        return [reason] if reason else []
+
+    def imitated(self, o: Outcome) -> bool:
+        """True if small faults come to the noise, and what they leave is none.
+
+        Many together imitate much, but hardly down to white noise.
+        """
+        faulty = bool(faults_among(o.model, o.task.bounds))
+        return faulty and at_noise(o) and not self._white(o)
+
+    def nothing_material(self, o: Outcome) -> bool:
+        """True if so little is left that nothing could explain MATERIAL of it."""
+        if strained(o) or self.imitated(o):
+            return False  # beliefs decide, or whiteness
+        return bool(per_output(o.held).max() < QUIETEST + MATERIAL**2)
+
+    def to_be_earned(self, base: Outcome) -> float:
+        """chi2/N of training records that a fit on top of a base has to come to, to be earned.
+
+        It has to explain MATERIAL in one output of the records held out. Of those that it is
+        fitted to it explains about as much; where they are almost at the noise, a part of that.
+        """
+        if strained(base) or self.imitated(base):
+            return np.inf
+        count = base.train.count.sum(axis=0)
+        least = MATERIAL**2 * float(count.min() / count.sum())
+        error = base.train.normalised_error
+        return error - HALF_SEEN * min(least, max(error - 1.0, 0.0))
+
+    def _white(self, o: Outcome) -> bool:
+        return independent_samples(o.residuals, self.steps) > WHITE * samples(o)
+
+
+def explained_by(base: Outcome, o: Outcome) -> float:
+    """What an outcome explains of the base's error on held-out records, [sigma of the noise].
+
+    In the output in which it is most.
+    """
+    less = per_output(base.held) - per_output(o.held)
+    return float(np.sqrt(np.clip(less, 0, None)).max())
+
+
+def share_explained(before: Fit, after: Fit) -> float:
+    """Share of the squared error above the noise that is gone, 0 to 1."""
+    gone = before.normalised_error - after.normalised_error
+    return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
+
+
+def _known_at_all(o: Outcome) -> bool:
+    """Whether the first parameter of an effect, its size, exceeds its standard deviation."""
+    size, sigma, _ = next(iter(own_parameters(o).values()), (0.0, np.inf, ''))
+    return abs(size) > sigma
+
+
+def above_noise(o: Outcome) -> float:
+    """chi2/N of all records less that of noise."""
+    return chi2(o) / samples(o) - 1
+
+
+def _own_values(o: Outcome) -> int:
+    """All that the records have of their own: initial motions, and what the effects add."""
+    motions = sum(len(motion) - len(o.train.own) for motion in (*o.train.motions, *o.held.motions))
+    return motions + o.unknowns - shared_unknowns(o.train, o.task.bounds)
+
+
+def settled(o: Outcome) -> bool:
+    """True if nothing is left to explain: no error, and no numbers that nobody believes."""
+    return at_noise(o) and not strained(o)
+
+
+def at_noise(o: Outcome) -> bool:
+    """True if every output is simulated down to noise, in training and on records held out."""
+    return bool((per_output(o.train) < AT_NOISE).all() and (per_output(o.held) < AT_NOISE).all())
+
+
+def samples(o: Outcome) -> float:
+    """Number of samples, training and held-out trials together."""
+    return float(o.train.count.sum() + o.held.count.sum())
+
+
+def _evidence(o: Outcome, independent: float) -> float:
+    return evidence(chi2(o), samples(o), independent, o.unknowns, o.belief)

@@ -1,0 +1,329 @@
+"""The race of all candidates on top of one model: who is fitted, in what order, and how far.
+
+    first look (glimpse.py), the light ones before the heavy
+      -> those that look best are fitted to whole records, then all others within reach
+      -> ever longer fits of those that may still win
+
+What one comes to is what the next are measured by: a fit out of reach that gains little is broken
+off, so that a library of effects costs little more than those of them that matter.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.identify import Fit
+from cg_sysid.search.candidates import (
+    FOLLOWED,
+    SAME,
+    SETTLED,
+    Look,
+    Outcome,
+    Task,
+    chi2,
+    cost_of,
+    deeper,
+    eventful,
+    led_on,
+    look_at,
+    try_candidate,
+)
+from cg_sysid.search.events import undisturbed
+from cg_sysid.search.model_selection import samples
+from cg_sysid.search.nuisance import imperfect
+
+log = logging.getLogger(__name__)
+
+RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
+IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
+NEAR = 3.0  # the same where that error is the noise
+AS_GOOD = 1.2  # times what is to be beaten, from which a candidate does not come up to it
+HOPE = 10.0  # times what the last rung gained, from which it may still win
+NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
+FAVOURED = 2.0  # times what the best look leaves above the noise, to be fitted first
+MOST = 3.0  # an error that is so many times smaller is mostly explained
+IDLE = 0.3  # of what the best explains: who explains less is idle beside it
+MUCH = 1.5  # chi2/N of a model of which much is wrong
+HEAVY = 10  # cost from which a candidate is looked at when the others have been
+FIRST_FEW = 8  # of the light candidates, that may show that the base was in a local minimum
+FEWEST = 5  # candidates that are fitted to whole records whatever the first look says
+
+CarryOut = Callable[[Callable, list[tuple], str], list]
+Effects = Sequence[tuple[str, str | None]]
+
+
+class Race:
+    """Fits of candidates on the trials of one diagnosis.
+
+    Args:
+        train: Trials to fit.
+        held: Trials held out.
+        carry_out: Does independent pieces of work: (function, arguments of each, what) -> results.
+    """
+
+    def __init__(self, train: Sequence[Trial], held: Sequence[Trial], carry_out: CarryOut):
+        self.train, self.held, self.carry_out = train, held, carry_out
+        self.looks: dict[tuple, Look | str] = {}  # by _structure
+
+    def fit(self, tasks: Sequence[Task], what: str) -> list[Outcome | str]:
+        """Fits to whole records, in the order of the tasks; a sentence for one that failed."""
+        return self.carry_out(try_candidate, [(t, self.train, self.held) for t in tasks], what)
+
+    def look(self, tasks: Sequence[Task], what: str) -> list[Look]:
+        """First looks, without those that failed; what was looked at is known.
+
+        Those at the same beside other small faults lead the way.
+        """
+        new = [task for task in tasks if _structure(task) not in self.looks]
+        before = [self._known_beside(task) for task in new]
+        led = [replace(task, leads=known.task.leads) if known else task
+               for task, known in zip(new, before, strict=True)]  # fmt: skip
+        looks = self.carry_out(look_at, [(task, self.train) for task in led], what)
+        for task, look in zip(new, looks, strict=True):
+            self.looks[_structure(task)] = look
+            if isinstance(look, str):
+                log.info('%s: %s', task.effect, look)
+        known = [self.looks[_structure(task)] for task in tasks]
+        return [look for look in known if isinstance(look, Look)]
+
+    def look_beside(self, tasks: Sequence[Task], what: str) -> list[Look]:
+        """First looks, or what is known of the same effects beside other small faults."""
+        known = [look for task in tasks if (look := self._known_beside(task))]
+        effects = {look.task.effect for look in known}
+        return [*known, *self.look([t for t in tasks if t.effect not in effects], what)]
+
+    def _known_beside(self, task: Task) -> Look | None:
+        """A look at the same effect on the same causes, as one for this task."""
+        for look in self.looks.values():
+            if not isinstance(look, Look) or not look.task.leads:
+                continue
+            if look.task.effect == task.effect and _causes(look.task) == _causes(task):
+                return led_on(look, task)
+        return None
+
+    def run(
+        self, base: Task, effects: Effects, what: str, beaten: float = np.inf,
+        earned: float = np.inf,
+    ) -> tuple[list[Outcome], list[str]]:
+        """Fit every effect on top of a base.
+
+        Args:
+            base: The task of the base, with its fits.
+            effects: Effects and places.
+            what: For the progress.
+            beaten: chi2/N that is to be beaten, or nearly so.
+            earned: chi2/N that has to be come to (Jury.to_be_earned).
+
+        Returns:
+            Outcomes of fits to whole records, and labels of those that were not worth one.
+        """
+        tasks = _on_top(base, effects)
+        events = [task for task in tasks if eventful(task)]
+        others = [task for task in tasks if not eventful(task)]
+        looking = f'first look at {what}'
+        looks = self.look(_light(others), looking)
+        found: dict[str, Outcome] = {}
+        if events and _nothing_helps(base, looks) and self._happened(base, what):
+            found, events = self._fitted(events, f'{what}, events'), []
+        # What is on top of a base has to come below it.
+        known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
+        reach = min(known, worth_having(_clear(_smallest(looks), base.first), base.first))
+        heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
+        looks += self.look(_longest_first(heavy), looking)
+        tried: set[str] = set()
+        for limit in (_favoured(_smallest(looks)), np.inf):
+            best = _best(found)
+            reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base), earned)
+            fewest = FEWEST if np.isinf(beaten) else 0
+            heat = [look for look in _worth_more(looks, reach, base.first, fewest)
+                    if look.label not in tried and _known(look) <= limit]  # fmt: skip
+            tried.update(look.label for look in heat)
+            found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
+        # To seek events in every record takes long: first what explains most of the error.
+        best = min(_best(found), beaten)
+        if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
+            found |= self._fitted(events, f'{what}, events')
+        found |= self._in_more_depth(found, base.base, beaten, earned, what)
+        return list(found.values()), [look.label for look in looks if look.label not in tried]
+
+    def _in_more_depth(
+        self, found: Mapping[str, Outcome], base: Fit | None, beaten: float, earned: float,
+        what: str,
+    ) -> dict[str, Outcome]:
+        """Ever longer fits of those that may still win."""
+        found, beaten = dict(found), min(beaten, _error(base))
+        gained: dict[str, float] = {}
+        for iterations in RUNGS[1:]:
+            limit = min(earned, worth_having(_best(found), base))
+            going = _may_still_win(found, gained, beaten, limit)
+            again = self._fitted(
+                [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
+                f'{what}, in more depth',
+            )
+            gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
+            found |= {n: again[n] for n, gain in gained.items() if gain > 0}
+        return found
+
+    def lead_deeper(self, base: Task, effects: Effects, what: str) -> Fit | None:
+        """Where the base's own numbers come to in the first seconds, with one effect more or none.
+
+        An effect more may be no more than a way out of a local minimum of the base: play has
+        many, and whatever is put on top of it would seem to help.
+
+        Args:
+            base: The task of the base, with its fits.
+            effects: Effects and places.
+            what: For the progress.
+
+        Returns:
+            A fit of the base alone to go on from, if one lies deeper than its own.
+        """
+        if base.first is None:
+            return None
+        if _error(base.first) < SETTLED < _error(base.base):
+            return base.first
+        light = _light(_on_top(base, effects))
+        found: list[Fit] = []
+        # Many lead the same way: the first few may do.
+        for tasks in (light[-FIRST_FEW:], light[:-FIRST_FEW]):
+            looks = self.look(tasks, f'first look at {what}')
+            limit = base.first.normalised_error / SAME
+            best = sorted((k for k in looks if _known(k) < limit), key=_known)[:FOLLOWED]
+            arguments = [(base, look.task.leads[0], self.train) for look in best]
+            found += filter(None, self.carry_out(deeper, arguments, f'{what}, and without them'))
+            if any(fit.normalised_error < SETTLED for fit in found):
+                break
+        return min(found, key=lambda fit: fit.normalised_error, default=None)
+
+    def forget(self, base: Task) -> None:
+        """Looks at what stands on top of a base, which set out from its values."""
+        self.looks = {key: look for key, look in self.looks.items() if key[:2] != _of(base)}
+
+    def _happened(self, base: Task, what: str) -> bool:
+        """Whether few pieces of the records are spoilt and all others are as they should be."""
+        arguments = [(base.model, self.train, base.bounds)]
+        return self.carry_out(undisturbed, arguments, f'{what}, piece by piece')[0] is not None
+
+    def _fitted(self, tasks: Iterable[Task], what: str) -> dict[str, Outcome]:
+        found, tasks = {}, _longest_first(tasks)
+        for task, outcome in zip(tasks, self.fit(tasks, what), strict=True):
+            if isinstance(outcome, str):
+                log.info('%s: %s', task.effect, outcome)
+            else:
+                found[outcome.label] = outcome
+        return found
+
+
+def _structure(task: Task) -> tuple:
+    """What tells first looks apart: the base, and what is tried on top of it."""
+    return *_of(task), task.effect
+
+
+def _of(base: Task) -> tuple:
+    """What tells bases apart: their effects and small faults."""
+    return frozenset(effect.label for effect in base.model.effects), frozenset(base.bounds)
+
+
+def _causes(base: Task) -> frozenset[str]:
+    """Labels of a base's effects, less small faults."""
+    labels = frozenset(effect.label for effect in base.model.effects)
+    return labels - imperfect(base.model, base.bounds)
+
+
+def _on_top(base: Task, effects: Effects) -> list[Task]:
+    return [replace(base, effect=effect, iterations=RUNGS[0]) for effect in effects]
+
+
+def _light(tasks: Iterable[Task]) -> list[Task]:
+    """Those that are looked at before the heavy ones, the longest first."""
+    return _longest_first(t for t in tasks if not eventful(t) and cost_of(t) < HEAVY)
+
+
+def _longest_first(tasks: Iterable[Task]) -> list[Task]:
+    """Or the last of them would be waited for."""
+    return sorted(tasks, key=cost_of, reverse=True)
+
+
+def _known(look: Look) -> float:
+    """Its error; infinite where the first seconds cannot tell."""
+    return look.error if np.isfinite(look.error) else np.inf
+
+
+def _error(found: Fit | None) -> float:
+    return np.inf if found is None else found.normalised_error
+
+
+def _smallest(looks: Iterable[Look]) -> float:
+    return min(map(_known, looks), default=np.inf)
+
+
+def _best(found: Mapping[str, Outcome]) -> float:
+    return min((o.train.normalised_error for o in found.values()), default=np.inf)
+
+
+def _reach(best: float) -> float:
+    """chi2/N within which a fit may still win over one that came to `best`."""
+    return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
+
+
+def _favoured(best: float) -> float:
+    """chi2/N up to which a look is as good as one that came to `best`."""
+    return max(SAME * best, 1 + FAVOURED * (best - 1))
+
+
+def worth_having(best: float, base: Fit | None) -> float:
+    """chi2/N that a fit on top of a base has to come to, if another came to `best`.
+
+    It has to be below the base's. What explains next to nothing of what another explains can wait
+    for the next round.
+    """
+    error = _error(base)
+    return error - IDLE * (error - best) if best < error < np.inf else error
+
+
+def _clear(best: float, first: Fit | None) -> float:
+    """The error of the best look, if that explains most of what is above the noise there.
+
+    The first seconds of records are not all of them: what explains a little more there says
+    nothing about the others.
+    """
+    return best if best - 1 < (_error(first) - 1) / MOST else np.inf
+
+
+def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
+    """Whether much is wrong that nothing explains in the first seconds."""
+    if base.base is None or base.first is None or base.base.normalised_error < MUCH:
+        return False
+    return base.first.normalised_error < MUCH or _smallest(looks) > MUCH
+
+
+def _worth_more(
+    looks: Sequence[Look], reach: float, first: Fit | None, fewest: int
+) -> list[Look]:
+    """Looks within reach of the best, and those that cannot tell."""
+    errors = sorted(filter(np.isfinite, map(_known, looks)))
+    if not errors:
+        return list(looks)
+    reach = min(reach, IN_REACH * errors[0], worth_having(_clear(errors[0], first), first))
+    limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
+    return [look for look in looks if not look.error > limit]
+
+
+def _may_still_win(
+    found: Mapping[str, Outcome], gained: Mapping[str, float], beaten: float, worth: float
+) -> list[Outcome]:
+    """Unfinished fits that are near the best, and do not come nearer too slowly."""
+    best = min(map(chi2, found.values()), default=0.0)
+    # What did not come below its base in eight iterations will not.
+    limit = min(worth, beaten / SAME if _best(found) < NOTHING_LEFT else np.inf)
+    going = [
+        o for label, o in found.items()
+        if not o.train.converged and chi2(o) < IN_REACH * min(best, beaten * samples(o))
+        and o.train.normalised_error < limit
+        and (label not in gained or chi2(o) - best <= HOPE * gained[label])
+    ]  # fmt: skip
+    # Where nobody else is after it the best has won.
+    return [] if [chi2(o) for o in going] == [best] else going

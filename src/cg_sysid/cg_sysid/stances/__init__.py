@@ -1,0 +1,1 @@
+"""Which foot stands: touchdowns of a walk, and the phases between them."""
