@@ -24,14 +24,18 @@ from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.checks.recordings import check_recording
-from cg_sysid.experiments import fault_injection as spoil
+from cg_sysid.experiments import fault_injection as fault_injection
 from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 
-SET_UPS = ('spring_stabilised_inner', 'spring_stabilised_outer', 'swing_inner_fixed',
-           'swing_outer_fixed')
+SET_UPS = (
+    'spring_stabilised_inner',
+    'spring_stabilised_outer',
+    'swing_inner_fixed',
+    'swing_outer_fixed',
+)
 OTHERS = ('legs_tied', 'chirp', 'open_loop_playback')
 SECONDS = 8.0
 SYNTHETIC = {
@@ -49,9 +53,13 @@ SYNTHETIC = {
 }
 # torque RMS in N m that keeps each pendulum from turning over
 PENDULUMS = {'sydney_pendulum': 0.04, 'dfki_double_pendulum': 0.2, 'xl330_pendulum': 0.1}
-TOPICS = ('/applied_torque', '/imu', '/hip_encoder', spoil.ALL)
-TOPIC_OF = {'hip_torque': '/applied_torque', 'imu_angle': '/imu', 'imu_rate': '/imu',
-            'hip_angle': '/hip_encoder'}
+TOPICS = ('/applied_torque', '/imu', '/hip_encoder', fault_injection.ALL)
+TOPIC_OF = {
+    'hip_torque': '/applied_torque',
+    'imu_angle': '/imu',
+    'imu_rate': '/imu',
+    'hip_angle': '/hip_encoder',
+}
 SHIFTS = {
     'hip_angle': (0.002, 0.005, 0.02, 0.1),
     'imu_angle': (0.002, 0.005, 0.02, 0.1),
@@ -64,22 +72,31 @@ UNITS = {'hip_angle': 'rad', 'imu_angle': 'rad', 'imu_rate': 'rad/s', 'hip_torqu
 def robot_record(machine, name, seed):
     e = load_experiment(name)
     settings = ExcitationSettings(**e.excitation, duration=SECONDS, seed=seed)
-    record = rehearse(name, machine, e.setup, e.initial_state, [make_signal(settings)], SECONDS,
-                      seed=seed)
-    return spoil.as_recorded(record, seed)
+    record = rehearse(
+        name, machine, e.setup, e.initial_state, [make_signal(settings)], SECONDS, seed=seed
+    )
+    return fault_injection.as_recorded(record, seed)
 
 
 def pendulum_record(name, seed):
     machine = Model.load(model_path(name))
     joints = len(machine.mechanism.joints)
     signals = [
-        make_signal(ExcitationSettings(amplitude=PENDULUMS[name], f_min=0.1, f_max=3.0,
-                                       duration=SECONDS, seed=10 * seed + i))
+        make_signal(
+            ExcitationSettings(
+                amplitude=PENDULUMS[name],
+                f_min=0.1,
+                f_max=3.0,
+                duration=SECONDS,
+                seed=10 * seed + i,
+            )
+        )
         for i in range(len(machine.mechanism.inputs))
     ]
-    record = rehearse(name, machine, Setup(), [0.3] * joints + [0.0] * joints, signals, SECONDS,
-                      seed=seed)
-    return spoil.as_recorded(record, seed)
+    record = rehearse(
+        name, machine, Setup(), [0.3] * joints + [0.0] * joints, signals, SECONDS, seed=seed
+    )
+    return fault_injection.as_recorded(record, seed)
 
 
 def sound(seeds) -> Iterator[tuple[str, list]]:
@@ -94,49 +111,85 @@ def sound(seeds) -> Iterator[tuple[str, list]]:
         yield name, [synthesise(Synthesis(**options), seed) for seed in range(seeds)]
     for effect in hideable_effects(nominal):
         machines = [hide(nominal, effect, 100 + seed).model for seed in range(seeds)]
-        yield f'{effect} hidden', [
-            robot_record(m, name, 100 + 10 * seed + i)
-            for seed, m in enumerate(machines) for i, name in enumerate(SET_UPS)
-        ]
+        yield (
+            f'{effect} hidden',
+            [
+                robot_record(m, name, 100 + 10 * seed + i)
+                for seed, m in enumerate(machines)
+                for i, name in enumerate(SET_UPS)
+            ],
+        )
 
 
 def faults(at, seed) -> Iterator[tuple[str, str, str, object]]:
     """(name, what, channel or topic concerned, fault) of every fault, setting in at `at` s."""
     for channel, sizes in SHIFTS.items():
         for size in sizes:
-            yield ('zero_shift', f'{channel} by {size:g} {UNITS[channel]}', channel,
-                   spoil.shifted(channel, size, at))
+            yield (
+                'zero_shift',
+                f'{channel} by {size:g} {UNITS[channel]}',
+                channel,
+                fault_injection.shifted(channel, size, at),
+            )
     for channel in SHIFTS:
-        yield 'sign_error', f'{channel}, all the time', channel, spoil.mirrored((channel,))
-        yield 'sign_error', f'{channel}, from the middle on', channel, spoil.mirrored(
-            (channel,), at)
+        yield (
+            'sign_error',
+            f'{channel}, all the time',
+            channel,
+            fault_injection.mirrored((channel,)),
+        )
+        yield (
+            'sign_error',
+            f'{channel}, from the middle on',
+            channel,
+            fault_injection.mirrored((channel,), at),
+        )
     both = ('imu_angle', 'imu_rate')
-    yield 'sign_error', 'imu_angle and imu_rate', 'imu_angle', spoil.mirrored(both)
+    yield 'sign_error', 'imu_angle and imu_rate', 'imu_angle', fault_injection.mirrored(both)
     for channel in SHIFTS:
         for share in (0.995, 0.98, 0.9, 0.6):
-            yield ('sensor_clipping', f'{channel}, {1 - share:.1%} of the time', channel,
-                   spoil.clipped(channel, share))
+            yield (
+                'sensor_clipping',
+                f'{channel}, {1 - share:.1%} of the time',
+                channel,
+                fault_injection.clipped(channel, share),
+            )
     for topic in TOPICS:
         for ratio in (2, 5):
             for honest in (True, False):
-                yield ('sampling_rate_change',
-                       f'{topic}, a {"half" if ratio == 2 else "fifth"} of it'
-                       + ('' if honest else ', stamps as before'), topic,
-                       spoil.decimated(topic, ratio, at, honest))
+                yield (
+                    'sampling_rate_change',
+                    f'{topic}, a {"half" if ratio == 2 else "fifth"} of it'
+                    + ('' if honest else ', stamps as before'),
+                    topic,
+                    fault_injection.decimated(topic, ratio, at, honest),
+                )
     for topic in TOPICS:
         for honest in (True, False):
             tail = '' if honest else ', stamps as if none were'
             for share in (0.002, 0.02, 0.2):
-                yield ('dropped_samples', f'{topic}, {share:.1%} at random{tail}', topic,
-                       spoil.thinned(topic, share, seed, honest))
+                yield (
+                    'dropped_samples',
+                    f'{topic}, {share:.1%} at random{tail}',
+                    topic,
+                    fault_injection.thinned(topic, share, seed, honest),
+                )
             for length in (0.006, 0.02, 0.1, 0.5):
-                yield ('dropped_samples', f'{topic}, {1e3 * length:g} ms{tail}', topic,
-                       spoil.interrupted(topic, length, at, honest))
+                yield (
+                    'dropped_samples',
+                    f'{topic}, {1e3 * length:g} ms{tail}',
+                    topic,
+                    fault_injection.interrupted(topic, length, at, honest),
+                )
     for topic in TOPICS:
         for size in (0.003, 0.01, 0.05, 0.5):
             for sign in (1, -1):
-                yield ('clock_jump', f'{topic} by {1e3 * sign * size:+g} ms', topic,
-                       spoil.jumped(topic, sign * size, at))
+                yield (
+                    'clock_jump',
+                    f'{topic} by {1e3 * sign * size:+g} ms',
+                    topic,
+                    fault_injection.jumped(topic, sign * size, at),
+                )
 
 
 def shows(raw, where) -> bool:
@@ -148,7 +201,7 @@ def judge(raw, name, where, at, model):
     """named, in place, unusable, repaired, missed of one spoilt recording."""
     report = check_recording(raw, model)
     places = {where, TOPIC_OF.get(where, where)}
-    named = [f for f in report.of(name) if where == spoil.ALL or f.where in places]
+    named = [f for f in report.of(name) if where == fault_injection.ALL or f.where in places]
     if where in ('hip_torque', 'hip_angle'):  # either, where only these two disagree
         named = named or [f for f in report.of(name) if f.where in ('hip_torque', 'hip_angle')]
     placed = [f for f in named if f.start_s is None or abs(f.start_s - at) < 0.25]
@@ -173,7 +226,7 @@ def fault_table(seeds, quick) -> Iterator[str]:
                         continue
                     spoilt = fault(raw)
                     if not arrivals:
-                        spoilt = spoil.without_arrivals(spoilt)
+                        spoilt = fault_injection.without_arrivals(spoilt)
                     row = judge(spoilt, name, where, at, model)
                     rows.setdefault((name, what), []).append(row)
         yield ''
@@ -186,8 +239,11 @@ def fault_table(seeds, quick) -> Iterator[str]:
         yield '|---|---|---:|---:|---:|---:|---:|---:|'
         for (name, what), found in rows.items():
             shares = np.mean(found, axis=0)
-            yield f'| `{name}` | {what} | {len(found)} | ' + ' | '.join(
-                f'{share:.0%}' for share in shares) + ' |'
+            yield (
+                f'| `{name}` | {what} | {len(found)} | '
+                + ' | '.join(f'{share:.0%}' for share in shares)
+                + ' |'
+            )
 
 
 def sound_table(seeds) -> Iterator[str]:
@@ -196,9 +252,13 @@ def sound_table(seeds) -> Iterator[str]:
     total = wrong = 0
     for name, raws in sound(seeds):
         reports = [
-            check_recording(raw, model_path(NOMINAL_MODEL) if raw.mechanism == 'compass_gait'
-                            and not raw.name.startswith('synthetic') else None)
-            for raw in (*raws, *map(spoil.without_arrivals, raws))
+            check_recording(
+                raw,
+                model_path(NOMINAL_MODEL)
+                if raw.mechanism == 'compass_gait' and not raw.name.startswith('synthetic')
+                else None,
+            )
+            for raw in (*raws, *map(fault_injection.without_arrivals, raws))
         ]
         unusable = sum(report.verdict == 'unusable' for report in reports)
         codes = {f.code for r in reports for f in r.findings if f.severity == 'warning'}
@@ -225,7 +285,9 @@ def main():
         options.write.write_text(
             f'# Faults of recordings: found, and cried wolf\n\nCommand: `{command}` '
             f'({(time.monotonic() - began) / 60:.0f} min on one core). '
-            + ' '.join(__doc__.split('\n\n')[2].split()) + f'\n\n{text}\n')
+            + ' '.join(__doc__.split('\n\n')[2].split())
+            + f'\n\n{text}\n'
+        )
 
 
 if __name__ == '__main__':

@@ -55,8 +55,11 @@ def plot(raw, report, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for signal in fault_signals(raw, report):
         figure = Figure(figsize=(7, 3), layout='constrained')
-        axes = figure.add_subplot(xlabel='s', ylabel=f'{signal.channel}, {signal.unit}',
-                                  title=f'{report.name}: {signal.code}')
+        axes = figure.add_subplot(
+            xlabel='s',
+            ylabel=f'{signal.channel}, {signal.unit}',
+            title=f'{report.name}: {signal.code}',
+        )
         axes.plot(signal.time, signal.values, '.-', lw=0.6, ms=3)
         axes.axvspan(signal.start, signal.stop, color='tab:red', alpha=0.3)
         figure.savefig(folder / f'{report.name}_{signal.code}_{signal.channel}.png', dpi=100)
@@ -75,8 +78,7 @@ def tables(data: Path, plots: Path | None) -> Iterator[str]:
         told: Counter[str] = Counter()
         for raw, report in zip(raws, reports, strict=True):
             told.update(sorted({f.code for f in report.findings if f.severity == 'warning'}))
-            refusals += [(name, report.name, f) for f in report.findings
-                         if f.severity == 'error']
+            refusals += [(name, report.name, f) for f in report.findings if f.severity == 'error']
             if plots is not None and report.verdict == 'unusable':
                 plot(raw, report, plots)
         refused, blind = (sum(r.verdict == 'unusable' for r in rs) for rs in (reports, alone))
@@ -87,8 +89,9 @@ def tables(data: Path, plots: Path | None) -> Iterator[str]:
     yield '|---|---|---|---|---|---|'
     for name, recording, f in refusals:
         reason = REASONS.get((name, f.code), 'not looked into')
-        yield (f'| {name} | {recording} | `{f.code}` | {f.where} {f.place} | {f.text} '
-               f'| {reason} |')
+        yield (
+            f'| {name} | {recording} | `{f.code}` | {f.where} {f.place} | {f.text} | {reason} |'
+        )
 
 
 def main():
@@ -105,7 +108,11 @@ def main():
         options.write.write_text(
             '# Recordings of real machines: what the check says\n\nCommand: `python '
             'bench/check_real.py DATA_DIR --plots DIR`. '
-            + ' '.join(__doc__.split('\n\n')[2].split()) + '\n\n' + '\n'.join(lines) + '\n')
+            + ' '.join(__doc__.split('\n\n')[2].split())
+            + '\n\n'
+            + '\n'.join(lines)
+            + '\n'
+        )
 
 
 if __name__ == '__main__':

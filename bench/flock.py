@@ -74,7 +74,10 @@ class Physics:
                 fall.ctypes.data, up.ctypes.data, SHORTEST if lands else np.inf, self._length_at
             )
             self._library.flock_move(
-                st, len(rows), *(a.ctypes.data for a in (y, v, q, t)), ctypes.addressof(ground),
+                st,
+                len(rows),
+                *(a.ctypes.data for a in (y, v, q, t)),
+                ctypes.addressof(ground),
                 left.ctypes.data,
             )
             x[rows], rest[rows] = y, left
@@ -95,9 +98,7 @@ class Physics:
             rows = np.flatnonzero(leg == st)
             y, q = np.ascontiguousarray(x[rows]), self.rows(len(rows))
             a, b = np.empty_like(y), np.empty_like(y)
-            self._library.flock_rates(
-                st, len(rows), *(v.ctypes.data for v in (y, q, a, b))
-            )
+            self._library.flock_rates(st, len(rows), *(v.ctypes.data for v in (y, q, a, b)))
             idle[rows], pushed[rows] = a, b
         return idle, pushed
 
@@ -371,8 +372,15 @@ class Walked:
 
 
 def walked(
-    robot: Model, flock: Flock, law, steps: int, duration: float, known: Model | None = None,
-    epsilon: float = 0.01, seed: int = 0, watch=None,
+    robot: Model,
+    flock: Flock,
+    law,
+    steps: int,
+    duration: float,
+    known: Model | None = None,
+    epsilon: float = 0.01,
+    seed: int = 0,
+    watch=None,
 ) -> Walked:
     """Let them walk until they have made so many steps, have fallen, or time is over.
 

@@ -47,7 +47,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit, score
 from cg_sysid.identification.unknowns import own_unknowns
-from cg_sysid.search.nuisance import with_imperfections
+from cg_sysid.search.nuisance import with_nuisances
 from cg_sysid.search.ranking import effect_name, per_output
 
 PROGRAMME = (
@@ -82,8 +82,15 @@ def records_of(machine, seed, spring_error=0.0, programme=PROGRAMME, seconds=SEC
                 replace(s, stiffness=s.stiffness * (1 + spring_error)) for s in e.setup.springs
             ),
         )
-        record = rehearse(f'{i}_{name}', machine, true, e.initial_state,
-                          [make_signal(settings)], seconds, seed=1000 * seed + i)
+        record = rehearse(
+            f'{i}_{name}',
+            machine,
+            true,
+            e.initial_state,
+            [make_signal(settings)],
+            seconds,
+            seed=1000 * seed + i,
+        )
         found.append(replace(record, setup=e.setup))
     return found
 
@@ -95,8 +102,10 @@ def with_small_faults(machine):
         if all(name != e.label for e in machine.effects):
             machine = machine.with_effect(name, None, **values)
     key = 'coulomb_friction.transition_rate'
-    return machine.with_values({key: 0.5 * machine.values[key]}) if key in machine.values else (
-        machine
+    return (
+        machine.with_values({key: 0.5 * machine.values[key]})
+        if key in machine.values
+        else (machine)
     )
 
 
@@ -121,9 +130,7 @@ def hide(nominal, effects, size, seed):
 
 def case(effects, size, seed, faults, workers=None):
     """One line of the raw results."""
-    nominal, machine, values = hide(
-        Model.load(model_path(NOMINAL_MODEL)), effects, size, seed
-    )
+    nominal, machine, values = hide(Model.load(model_path(NOMINAL_MODEL)), effects, size, seed)
     if faults:
         machine = with_small_faults(machine)
     records = records_of(machine, seed, SPRING_ERROR * faults)
@@ -133,7 +140,7 @@ def case(effects, size, seed, faults, workers=None):
 
 def share_of(nominal, records, hidden, faults):
     """What the least of these effects explains, whatever a diagnosis says, in noise sigmas."""
-    train, held = split([led_in(trial) for trial in prepare(nominal, records)])
+    train, held = split([led_in(data_set) for data_set in prepare(nominal, records)])
 
     def left(names):
         """chi2/N of each output on held-out records with these effects."""
@@ -141,9 +148,9 @@ def share_of(nominal, records, hidden, faults):
         for name in names:
             model = model.with_effect(name, None, **hidden[name])
         if faults:
-            model, bounds = with_imperfections(model, [t.setup for t in (*train, *held)])
+            model, bounds = with_nuisances(model, [t.setup for t in (*train, *held)])
         happened = {u.name: u.prior for u in own_unknowns(model)}
-        own = {trial.name: happened for trial in (*train, *held)}
+        own = {data_set.name: happened for data_set in (*train, *held)}
         found = fit(model, train, own=own, bounds=bounds)
         return per_output(score(found.model, held, own=own))
 

@@ -22,8 +22,13 @@ from cg_sysid.checks.recordings import check_recording
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 
 RATE = 500.0
-FREE = {'mechanism': 'double_pendulum', 'torque': 'zero', 'bandwidth': 1.0, 'amplitude': 1.5,
-        'quantum': 0.0}
+FREE = {
+    'mechanism': 'double_pendulum',
+    'torque': 'zero',
+    'bandwidth': 1.0,
+    'amplitude': 1.5,
+    'quantum': 0.0,
+}
 COUNT = 2 * np.pi / 8192
 JITTER = (0.0, 1e-4, 2e-4, 4e-4, 1e-3)
 
@@ -50,8 +55,11 @@ def swing(seed, sigma, rounding):
     topics = {}
     for name, t in raw.topics.items():
         stamp = t.stamp_ns[0] + np.rint(np.arange(len(t)) * 1e9 / RATE).astype(np.int64)
-        values = t.values if change is None or name != '/joint_states' else {
-            channel: change(v) for channel, v in t.values.items()}
+        values = (
+            t.values
+            if change is None or name != '/joint_states'
+            else {channel: change(v) for channel, v in t.values.items()}
+        )
         topics[name] = replace(t, stamp_ns=stamp, values=values)
     return replace(raw, topics=topics)
 
@@ -67,8 +75,10 @@ def told_table(seeds) -> Iterator[str]:
             by = f' ({", ".join(sorted(codes))})' if codes else ''
             sizes = [1e3 * max(f.value for f in r.of('jitter')) for r in reports if r.of('jitter')]
             size = f'{np.median(sizes):.2f}' if sizes else '-'
-            yield (f'| {rounding} | {1e3 * sigma:g} | {seeds} | {len(refused)}{by} | {len(sizes)} '
-                   f'| {size} |')
+            yield (
+                f'| {rounding} | {1e3 * sigma:g} | {seeds} | {len(refused)}{by} | {len(sizes)} '
+                f'| {size} |'
+            )
 
 
 def false_table(seeds) -> Iterator[str]:
@@ -97,8 +107,11 @@ def main():
         options.write.write_text(
             '# Hidden jitter and odd rounding: told, not refused\n\nCommand: `python '
             f'bench/hidden_jitter.py --seeds {options.seeds}`. '
-            + ' '.join(__doc__.split('\n\n')[2].split()) + '\n\n' + '\n'.join(lines).rstrip()
-            + '\n')
+            + ' '.join(__doc__.split('\n\n')[2].split())
+            + '\n\n'
+            + '\n'.join(lines).rstrip()
+            + '\n'
+        )
 
 
 if __name__ == '__main__':

@@ -49,23 +49,25 @@ class Problem:
     The unknowns are the eight parameters and, record by record, the initial motion (12 numbers).
     """
 
-    def __init__(self, model, trials):
-        self.model, self.trials = model, trials
+    def __init__(self, model, data_sets):
+        self.model, self.data_sets = model, data_sets
         self.unknowns = unknowns_of(model)
         self.names = [u.name for u in self.unknowns]
-        self.compiled = [compile_model(model, trial.setup) for trial in trials]
-        self.vectors = [parameter_vector(model, trial.setup) for trial in trials]
+        self.compiled = [compile_model(model, data_set.setup) for data_set in data_sets]
+        self.vectors = [parameter_vector(model, data_set.setup) for data_set in data_sets]
         self.places = [
             [c.parameter_names.index(name) for name in self.names] for c in self.compiled
         ]
-        self.sizes = [len(trial.motion) for trial in trials]
+        self.sizes = [len(data_set.motion) for data_set in data_sets]
         self.lower = np.array([u.lower for u in self.unknowns])
         self.upper = np.array([u.upper for u in self.unknowns])
         self.calls = 0
 
     def pack(self, values, motions=None):
         """All unknowns in one vector."""
-        return np.concatenate([values, *(motions or [trial.motion for trial in self.trials])])
+        return np.concatenate(
+            [values, *(motions or [data_set.motion for data_set in self.data_sets])]
+        )
 
     def residuals(self, z, integrate=None):
         """Weighted residuals of all records, then those of the beliefs."""
@@ -73,22 +75,26 @@ class Problem:
         k = len(self.names)
         values = z[:k]
         parts, at = [], k
-        real = all(c > 0 for c in self.model.mechanism.consistency(
-            self.model.values | dict(zip(self.names, values, strict=True))))
+        real = all(
+            c > 0
+            for c in self.model.mechanism.consistency(
+                self.model.values | dict(zip(self.names, values, strict=True))
+            )
+        )
         if (values < self.lower).any() or (values > self.upper).any() or not real:
             return None
-        for i, (trial, compiled) in enumerate(zip(self.trials, self.compiled, strict=True)):
+        for i, (data_set, compiled) in enumerate(zip(self.data_sets, self.compiled, strict=True)):
             p = self.vectors[i]
             p[self.places[i]] = values
             motion = z[at : at + self.sizes[i]]
             at += self.sizes[i]
             try:
-                states = (integrate or _compiled_states)(compiled, trial, motion, p)
-                y = compiled.outputs(trial.time, trial.inputs, states, p)
+                states = (integrate or _compiled_states)(compiled, data_set, motion, p)
+                y = compiled.outputs(data_set.time, data_set.inputs, states, p)
             except DynamicsError:
                 return None
-            parts.append(((y - trial.outputs) / trial.sigma).ravel())
-            parts.append((motion - trial.motion) / trial.motion_sigma)
+            parts.append(((y - data_set.outputs) / data_set.sigma).ravel())
+            parts.append((motion - data_set.motion) / data_set.motion_sigma)
         belief = [(v - u.prior) / u.tolerance for u, v in zip(self.unknowns, values, strict=True)]
         return np.concatenate([*parts, belief])
 
@@ -98,20 +104,20 @@ class Problem:
         return FAR if r is None else float(r @ r)
 
 
-def _compiled_states(compiled, trial, motion, p):
-    return compiled.simulate(trial.time, trial.inputs, motion, p)
+def _compiled_states(compiled, data_set, motion, p):
+    return compiled.simulate(data_set.time, data_set.inputs, motion, p)
 
 
-def _solve_ivp_states(compiled, trial, motion, p):
+def _solve_ivp_states(compiled, data_set, motion, p):
     """The way of the thesis: a general-purpose integrator around a Python right-hand side."""
-    step = trial.time[1] - trial.time[0]
+    step = data_set.time[1] - data_set.time[0]
 
     def rates(t, x):
-        k = min(int(t / step + 1e-9), len(trial.time) - 1)
-        return np.asarray(compiled.f(x, trial.inputs[k], p)).ravel()
+        k = min(int(t / step + 1e-9), len(data_set.time) - 1)
+        return np.asarray(compiled.f(x, data_set.inputs[k], p)).ravel()
 
     solution = solve_ivp(
-        rates, (0, trial.time[-1]), motion, t_eval=trial.time, rtol=1e-6, atol=1e-8,
+        rates, (0, data_set.time[-1]), motion, t_eval=data_set.time, rtol=1e-6, atol=1e-8,
         max_step=4 * step,
     )  # fmt: skip
     return np.ascontiguousarray(solution.y.T)
@@ -123,8 +129,15 @@ def records_of(machine, seed):
         e = load_experiment(name)
         settings = ExcitationSettings(**e.excitation, duration=SECONDS, seed=10 * seed + i)
         found.append(
-            rehearse(name, machine, e.setup, e.initial_state, [make_signal(settings)], SECONDS,
-                     seed=100 * seed + i)
+            rehearse(
+                name,
+                machine,
+                e.setup,
+                e.initial_state,
+                [make_signal(settings)],
+                SECONDS,
+                seed=100 * seed + i,
+            )
         )
     return found
 
@@ -146,11 +159,11 @@ def start_models(nominal, truth, count):
         yield model
 
 
-def ours(problem, model, start, trials):
+def ours(problem, model, start, data_sets):
     """Our fit: set out from `start`, believing what the nominal file believes."""
     began = time.process_time()
     at = {name: start.values[name] for name in problem.names}
-    found = fit(model, trials, at=at)
+    found = fit(model, data_sets, at=at)
     spent = time.process_time() - began
     cost = problem.cost(problem.pack(found.values, list(found.motions)))
     return spent, cost, found.values, found.evaluations
@@ -172,9 +185,19 @@ def nelder_mead(problem, model, limit, integrate=None):
     scale = np.where(np.abs(z0) > 1e-6, 0.05 * np.abs(z0), 0.01)
     simplex = np.vstack([z0, z0 + np.diag(scale)])
     try:
-        minimize(timed, z0, method='Nelder-Mead',
-                 options={'initial_simplex': simplex, 'maxiter': 100000, 'maxfev': 100000,
-                          'adaptive': True, 'xatol': 1e-7, 'fatol': 1.0})
+        minimize(
+            timed,
+            z0,
+            method='Nelder-Mead',
+            options={
+                'initial_simplex': simplex,
+                'maxiter': 100000,
+                'maxfev': 100000,
+                'adaptive': True,
+                'xatol': 1e-7,
+                'fatol': 1.0,
+            },
+        )
     except TimeoutError:
         pass
     return time.process_time() - began, best[0], best[1][: len(problem.names)], problem.calls
@@ -209,14 +232,14 @@ def main():
     nominal = Model.load(model_path(NOMINAL_MODEL))
     truth, _ = perturb(nominal, np.random.default_rng(1))
     records = records_of(truth, 1)
-    trials = prepare(nominal, records)
+    data_sets = prepare(nominal, records)
     true = np.array([truth.values[u.name] for u in unknowns_of(nominal)])
     models = list(start_models(nominal, truth, options.starts))
     # Every start believes the same: the belief is part of the cost, the start is not.
-    problem = Problem(nominal, trials)
-    fit(nominal, trials)  # compile before the clock runs
+    problem = Problem(nominal, data_sets)
+    fit(nominal, data_sets)  # compile before the clock runs
 
-    rows = {'ours': [ours(problem, nominal, m, trials) for m in models]}
+    rows = {'ours': [ours(problem, nominal, m, data_sets) for m in models]}
     best = min(cost for _, cost, _, _ in rows['ours'])
     few = models[: options.slow_starts]
     rows['least_squares, finite differences, same compiled simulator'] = [

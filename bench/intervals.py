@@ -27,7 +27,7 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.parallel import run_all
 from cg_sysid.search.candidates import THOROUGH_ITERATIONS
-from cg_sysid.search.nuisance import with_imperfections
+from cg_sysid.search.nuisance import with_nuisances
 
 SIZES = 1.0, 0.5
 SHORT_OF = 0.8  # of the true values, where the fit sets out
@@ -41,12 +41,12 @@ def z_scores(name, seed, faults):
     nominal, machine, hidden = hide(Model.load(model_path(NOMINAL_MODEL)), (name,), size, seed)
     machine = with_small_faults(machine) if faults else machine
     records = records_of(machine, seed, SPRING_ERROR * faults)
-    train, held = split([led_in(trial) for trial in prepare(nominal, records)])
+    train, held = split([led_in(data_set) for data_set in prepare(nominal, records)])
     values = hidden[name]  # none of those that the nominal model had, and has lost here
     structure = nominal.with_effect(name, None, **{n: SHORT_OF * v for n, v in values.items()})
     bounds = {}
     if faults:
-        structure, bounds = with_imperfections(structure, [t.setup for t in (*train, *held)])
+        structure, bounds = with_nuisances(structure, [t.setup for t in (*train, *held)])
     found = fit(structure, train, bounds=bounds, thorough=True, iterations=THOROUGH_ITERATIONS)
     numbers = {
         u.name: (value, sigma, u.unit)

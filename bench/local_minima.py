@@ -23,7 +23,14 @@ from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import RUNGS, split
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.search.candidates import Look, Outcome, Task, look_at, own_parameters, try_candidate
+from cg_sysid.search.candidates import (
+    Outcome,
+    Screening,
+    Task,
+    own_parameters,
+    screen,
+    try_candidate,
+)
 
 LONG_S, SIX = 20.0, PROGRAMME[:6]
 SIZES = (0.5, 1.0, 2.0)
@@ -39,9 +46,9 @@ def attempt(effect, seed, long):
     records = records_of(machine, seed, programme=programme, seconds=seconds)
     train, held = split(prepare(nominal, records))
     began = time.monotonic()
-    look = look_at(Task(nominal, (effect, None)), train)
-    assert isinstance(look, Look), look
-    found = try_candidate(replace(look.task, iterations=sum(RUNGS)), train, held)
+    screening = screen(Task(nominal, (effect, None)), train)
+    assert isinstance(screening, Screening), screening
+    found = try_candidate(replace(screening.task, iterations=sum(RUNGS)), train, held)
     took = time.monotonic() - began
     if not isinstance(found, Outcome):
         return values[effect], found, float('inf'), took

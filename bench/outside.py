@@ -218,8 +218,13 @@ def own_friction(case: Case, truth: dict[str, float]) -> Secret:
 
 
 def record(
-    experiment: str, truth: dict[str, float], secret: Secret, nominal: Model, case: Case,
-    machine: Machine, seconds: float = SECONDS,
+    experiment: str,
+    truth: dict[str, float],
+    secret: Secret,
+    nominal: Model,
+    case: Case,
+    machine: Machine,
+    seconds: float = SECONDS,
 ) -> Record:
     """One recording of MuJoCo's robot."""
     e = load_experiment(experiment)
@@ -367,9 +372,12 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
     cpu = [row['cpu_s'] for row in rows if 'cpu_s' in row]
     if inside:
         low, high = wilson(sum(inside), len(inside))
-        lines += ['', f'{sum(inside)} of {len(inside)} parameters of right causes lie inside '
-                  f'their 95 % interval ({low:.0%} to {high:.0%}), where the law is the '
-                  "library's."]
+        lines += [
+            '',
+            f'{sum(inside)} of {len(inside)} parameters of right causes lie inside '
+            f'their 95 % interval ({low:.0%} to {high:.0%}), where the law is the '
+            "library's.",
+        ]
     sound = [row for row in rows if row['case'].startswith('sound')]
     astray = sum(row['verdict'] == 'unexplained' for row in sound)
     described = [row.get('described', 0.0) for row in rows if row['group'] == 'unlisted']
@@ -378,9 +386,12 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
     if described:
         shares = ', '.join(f'{share:.0%}' for share in described)
         lines += ['', f'Share of the error that a learned term takes, unlisted: {shares}.']
-    lines += ['', f'All {len(rows)} cases: CPU time median {np.median(cpu):.0f} s, 95 % '
-              f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, compilation included; '
-              f'{sum(row["verdict"] == "unfinished" for row in rows)} without an end.']
+    lines += [
+        '',
+        f'All {len(rows)} cases: CPU time median {np.median(cpu):.0f} s, 95 % '
+        f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, compilation included; '
+        f'{sum(row["verdict"] == "unfinished" for row in rows)} without an end.',
+    ]
     return lines
 
 
@@ -390,8 +401,10 @@ def _order(group: str) -> int:
 
 def wrong_ones(rows: list[dict[str, Any]]) -> list[str]:
     """A line for each case that is not right."""
-    lines = ['| case | hidden | verdict | causes (rivals) | chi2/N before, after | CPU s |',
-             '|---|---|---|---|---:|---:|']
+    lines = [
+        '| case | hidden | verdict | causes (rivals) | chi2/N before, after | CPU s |',
+        '|---|---|---|---|---:|---:|',
+    ]
     for row in rows:
         if is_right(row):
             continue
@@ -403,16 +416,22 @@ def wrong_ones(rows: list[dict[str, Any]]) -> list[str]:
             for cause, rivals in zip(row['causes'], row['rivals'], strict=True)
         )
         errors = f'{row["before"]:.4g}, {row["after"]:.4g}' if 'before' in row else ''
-        lines.append(f'| {row["case"]} | {hidden} | {row["verdict"]} | {causes} | {errors} '
-                     f'| {row.get("cpu_s", "")} |')
+        lines.append(
+            f'| {row["case"]} | {hidden} | {row["verdict"]} | {causes} | {errors} '
+            f'| {row.get("cpu_s", "")} |'
+        )
     return lines
 
 
 def version_of_sources() -> str:
     """A hash of all sources that an answer depends on."""
     digest = hashlib.sha256()
-    files = [*ROOT.glob('src/cg_*/cg_*/**/*.py'), *ROOT.glob('src/cg_*/cg_*/**/*.c'),
-             *ROOT.glob('src/cg_description/models/*.yaml'), ROOT / 'bench/foreign_laws.py']
+    files = [
+        *ROOT.glob('src/cg_*/cg_*/**/*.py'),
+        *ROOT.glob('src/cg_*/cg_*/**/*.c'),
+        *ROOT.glob('src/cg_description/models/*.yaml'),
+        ROOT / 'bench/foreign_laws.py',
+    ]
     for file in sorted(files):
         digest.update(str(file.relative_to(ROOT)).encode() + file.read_bytes())
     return digest.hexdigest()[:12]
@@ -465,8 +484,17 @@ def main() -> int:
         rows[row['case']] = row
         with options.raw.open('a') as raw:
             raw.write(json.dumps(row) + '\n')
-        print(f'{done}/{len(missing)}', row['case'], *row['laws'], '->', row['verdict'],
-              *row['causes'], '' if is_right(row) else 'WRONG', row.get('cpu_s', ''), flush=True)
+        print(
+            f'{done}/{len(missing)}',
+            row['case'],
+            *row['laws'],
+            '->',
+            row['verdict'],
+            *row['causes'],
+            '' if is_right(row) else 'WRONG',
+            row.get('cpu_s', ''),
+            flush=True,
+        )
     made = [rows[case.name] for case in chosen if case.name in rows]
     if not made:
         print('no rows of these sources', file=sys.stderr)

@@ -67,16 +67,16 @@ class Row:
 
 
 def hidden_case(effect: str, seed: int) -> tuple[Case, list]:
-    """Trials of a machine with a secret, and the records behind them."""
+    """Data sets of a machine with a secret, and the records behind them."""
     secret = [] if effect == HEALTHY else [effect]
     nominal, machine, _ = hide(Model.load(model_path(NOMINAL_MODEL)), secret, 1.0, seed)
     records = records_of(machine, seed)
     # As the diagnosis does: what a delay or a lag was before the first row nobody knows.
-    trials = [
+    data_sets = [
         replace(t, outputs=np.where(t.time[:, None] < LEAD_IN_S, np.nan, t.outputs))
         for t in prepare(nominal, records)
     ]
-    train, held = split(trials)
+    train, held = split(data_sets)
     told = machine.without_effect(effect) if secret else machine
     return Case(nominal, tuple(train), tuple(held), told), records
 
@@ -102,8 +102,11 @@ def run(peer: str, effect: str, seed: int, case: Case, records: list, before: fl
     began = time.monotonic()
     answer = our_answer(case, records) if peer == 'diagnosis' else name_cause(peer)(case)
     row = Row(peer, effect, seed, answer, before, time.monotonic() - began)
-    print(f'{effect} {seed} {peer}: {answer.cause or "-"}, chi2/N {before:.3g} -> '
-          f'{answer.error:.3g}, strength {answer.strength:.3g}, {row.seconds:.0f} s', flush=True)
+    print(
+        f'{effect} {seed} {peer}: {answer.cause or "-"}, chi2/N {before:.3g} -> '
+        f'{answer.error:.3g}, strength {answer.strength:.3g}, {row.seconds:.0f} s',
+        flush=True,
+    )
     return row
 
 
@@ -144,7 +147,7 @@ def share(found) -> str:
 
 
 def baseline(case: Case) -> float:
-    """chi2/N on the held-out trials of the nominal model, identified anew."""
+    """chi2/N on the held-out data sets of the nominal model, identified anew."""
     from peers import grey_box
 
     found = grey_box.identify_nominal(case)

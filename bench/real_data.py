@@ -35,7 +35,7 @@ from cg_sysid.identification.measured_start import carried, from_measured_angles
 from cg_sysid.identification.windows import Windows, followed, windows_of
 from cg_sysid.records.bags import read_bag
 from cg_sysid.records.importing import import_to_bags
-from cg_sysid.search.candidates import believing
+from cg_sysid.search.candidates import with_priors_of
 from cg_sysid.text import measured
 
 BUDGET = 600.0  # s
@@ -107,13 +107,13 @@ def errors(study, model, judges, rows):
         held = from_measured_angles(model.mechanism, judges, fitted, rows)
         ways.append((held, score(model, held, fitted.own_by_name(judges))))
     summaries = []
-    for trials, found in ways:
+    for data_sets, found in ways:
         table = []
-        for trial, motion in zip(trials, found.motions, strict=True):
-            difference = predict(model, trial, motion) - trial.outputs
-            table.append([
-                study.measure(c) if np.isfinite(c).any() else np.nan for c in difference.T
-            ])
+        for data_set, motion in zip(data_sets, found.motions, strict=True):
+            difference = predict(model, data_set, motion) - data_set.outputs
+            table.append(
+                [study.measure(c) if np.isfinite(c).any() else np.nan for c in difference.T]
+            )
         summaries.append(study.summary(np.array(table), axis=0))
     return np.array(summaries)
 
@@ -144,7 +144,7 @@ def run(study, data, bags, workers, budget):
     found = diagnose(nominal, used, Options(workers=workers), deadline=Deadline(budget))
     searched = cpu_seconds() - before
     # The file's beliefs, and the effects found with their values as a start.
-    structure = believing(found.extended.model, nominal, '')
+    structure = with_priors_of(found.extended.model, nominal, '')
     extended = fit(structure, prepare(nominal, used)).model
     rows = {'published': errors(study, nominal, judges, carry)}
     if study.zeroed:

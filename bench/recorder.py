@@ -185,9 +185,7 @@ def killed(folder: Path, count: int, load: int) -> list[tuple[float, float]]:
 
 @contextmanager
 def busy(load: int) -> Iterator[None]:
-    processes = [
-        subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(load)
-    ]
+    processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(load)]
     try:
         yield
     finally:

@@ -59,7 +59,8 @@ def record(folder: Path, data: Path | None) -> None:
     slippery = nominal.with_effect('foot_slip', None, friction=0.35)
     sets['walk'] = [
         as_record(f'walk_{seed}', done, done.arcs[0].stance, seed)
-        for seed in (1, 2) for done in [walking(slippery, seed)]
+        for seed in (1, 2)
+        for done in [walking(slippery, seed)]
     ]
     for name, records in sets.items():
         _write(folder / name, records)

@@ -78,9 +78,7 @@ def main():
     parser.add_argument('data', type=Path)
     options = parser.parse_args()
     folder = options.data / 'bam_servo_pendulum'
-    logs = [
-        log for log in json.loads((folder / 'logs.json').read_text()) if log['kp'] == 200
-    ]
+    logs = [log for log in json.loads((folder / 'logs.json').read_text()) if log['kp'] == 200]
     files = sorted(folder.glob('published_params_*.json'))
     sets = [file.stem.removeprefix('published_params_') for file in files]
     print('| model | ' + ' | '.join(sets) + ' |')

@@ -284,9 +284,7 @@ def agreement_lines(count: int) -> list[str]:
         said = screen(PLANT, task)
         seconds = time.process_time() - began
         program = Program(PLANT, task, N)
-        truth = any(
-            program.solve(program.guess(guess), 100, 1e-6).converged for guess in GUESSES
-        )
+        truth = any(program.solve(program.guess(guess), 100, 1e-6).converged for guess in GUESSES)
         if said.best is not None and not truth:
             start = said.best.resampled(N)
             truth = program.solve(start, 100, 1e-6).converged
@@ -342,8 +340,7 @@ def motions_table() -> list[str]:
             whole.append(time.process_time() - began)
         said = f'{1e3 * np.median(cold):.1f}' if one.converged else 'not solved'
         lines.append(
-            f'| {name} | {said} | {1e3 * np.median(whole):.1f} | '
-            f'{done.provenance["cost"]:.4f} |'
+            f'| {name} | {said} | {1e3 * np.median(whole):.1f} | {done.provenance["cost"]:.4f} |'
         )
     return lines
 
@@ -376,9 +373,13 @@ def tvlqr_lines() -> list[str]:
     ours = timed(lambda: riccati(design, phase, Q, R, S), 50)
     theirs = timed(ivp, 9)
     S0 = riccati(design, phase, Q, R, S)[1][0]
-    exact = solve_ivp(
-        backward, (phase.end, phase.start), S.ravel(), rtol=1e-10, atol=1e-10, method='LSODA'
-    ).y[:, -1].reshape(4, 4)
+    exact = (
+        solve_ivp(
+            backward, (phase.end, phase.start), S.ravel(), rtol=1e-10, atol=1e-10, method='LSODA'
+        )
+        .y[:, -1]
+        .reshape(4, 4)
+    )
     error = np.abs(S0 - exact).max() / np.abs(exact).max()
     return [
         f'TVLQR of one phase with 50 knots: {1e3 * ours:.2f} ms; solve_ivp (RK45, tolerance 1e-6, '

@@ -48,9 +48,7 @@ def surfaces_row(speed: float, length: float, degrees: int) -> list[str]:
         began = time.process_time()
         found = with_surfaces(motion, ROBOT, method)
         spent = time.process_time() - began
-        radii = [
-            f'{t.well_posed.min():.2f}, {t.advancing.min():.2f}' for t in tube(found, ROBOT)
-        ]
+        radii = [f'{t.well_posed.min():.2f}, {t.advancing.min():.2f}' for t in tube(found, ROBOT)]
         began = time.process_time()
         stabilised = stabilise_transversely(found, ROBOT)
         solved = time.process_time() - began

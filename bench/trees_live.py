@@ -66,8 +66,14 @@ class Fared:
 
 
 def in_the_loop(
-    ready: ReadyTree | None, stance: str, x, epsilon: float | None, seed: int, pushes=(),
-    settings: RecoverySettings | None = None, duration: float = DURATION,
+    ready: ReadyTree | None,
+    stance: str,
+    x,
+    epsilon: float | None,
+    seed: int,
+    pushes=(),
+    settings: RecoverySettings | None = None,
+    duration: float = DURATION,
 ) -> tuple[BalanceRun, BalanceController | TreeController]:
     """One run of the loop, and the controller that was in it.
 
@@ -94,7 +100,12 @@ def in_the_loop(
 
 
 def recovered(
-    ready: ReadyTree | None, stance: str, x, epsilon: float | None, seed: int, pushes=(),
+    ready: ReadyTree | None,
+    stance: str,
+    x,
+    epsilon: float | None,
+    seed: int,
+    pushes=(),
     settings: RecoverySettings | None = None,
 ) -> Fared:
     """How one run of the loop ends; arguments as `in_the_loop`."""

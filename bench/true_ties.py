@@ -27,7 +27,7 @@ from cg_sysid.diagnosis.diagnose import led_in, split
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.parallel import run_all
 from cg_sysid.search.candidates import THOROUGH_ITERATIONS, Task, chi2, try_candidate
-from cg_sysid.search.nuisance import with_imperfections
+from cg_sysid.search.nuisance import with_nuisances
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -50,7 +50,7 @@ def structures(nominal, hidden, rival, setups):
     places = LIBRARY[rival].sites(nominal.mechanism)
     for gone in hidden:
         others = with_effects(nominal, [name for name in hidden if name != gone])
-        base, bounds = with_imperfections(others, setups)
+        base, bounds = with_nuisances(others, setups)
         for at in places:
             yield Task(base, (rival, at), bounds=bounds)
         for at in places[1:]:
@@ -84,9 +84,9 @@ def ties_of(row, workers=None):
     )
     machine = with_small_faults(machine) if faults else machine
     records = records_of(exact_sensors(machine), row['seed'], SPRING_ERROR * faults)
-    train, held = split([led_in(trial) for trial in prepare(nominal, records)])
-    setups = [trial.setup for trial in (*train, *held)]
-    others, bounds = with_imperfections(with_effects(nominal, hidden[1:]), setups)
+    train, held = split([led_in(data_set) for data_set in prepare(nominal, records)])
+    setups = [data_set.setup for data_set in (*train, *held)]
+    others, bounds = with_nuisances(with_effects(nominal, hidden[1:]), setups)
     truth = least([Task(others, (hidden[0], None), bounds=bounds)], train, held, workers)
     same = set(itertools.chain.from_iterable(s for s in THE_SAME if s & set(hidden)))
     rivals = [name for name in row['named'] if name not in hidden and name not in same]

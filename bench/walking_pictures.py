@@ -82,9 +82,7 @@ def draw_portrait(target: Path) -> None:
     settled = run.time > 8.0
     for axes, role in zip(panels, ('stance leg', 'swing leg'), strict=True):
         for leg, (stance, colour) in enumerate(COLOURS.items()):
-            on = np.flatnonzero(
-                nodes.orbiting & (nodes.orbit_of == orbit) & (nodes.stance == leg)
-            )
+            on = np.flatnonzero(nodes.orbiting & (nodes.orbit_of == orbit) & (nodes.stance == leg))
             shown = leg if role == 'stance leg' else 1 - leg
             pick = np.eye(4)[[shown, 2 + shown]]
             # At an impact itself hardly anything is left to be lost.

@@ -95,7 +95,8 @@ def readings(nodes: dict[str, Nodes]) -> list[str]:
             n = tree.surfaces[on[np.abs(stands).argmin()], 0]
             n = n[[leg, 1 - leg, 2 + leg, 3 - leg]]
             lines.append(
-                f'| {name[12:-1]} | {STANCES[leg]} | ' + ' | '.join(f'{v:.2f}' for v in n)
+                f'| {name[12:-1]} | {STANCES[leg]} | '
+                + ' | '.join(f'{v:.2f}' for v in n)
                 + f' | {n[2] / n[0]:.2f} |'
             )
     return lines

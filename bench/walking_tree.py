@@ -65,7 +65,12 @@ class Fared:
 
 
 def pushed(
-    ready: ReadyTree, speed: float, phase: float, impulse: float, known: bool, alone: bool,
+    ready: ReadyTree,
+    speed: float,
+    phase: float,
+    impulse: float,
+    known: bool,
+    alone: bool,
     seed: int,
 ) -> Fared:
     """One run of the loop.

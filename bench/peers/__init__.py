@@ -1,6 +1,6 @@
 """Peers of the diagnosis: other ways to name a cause, each as well made as its author could.
 
-Each peer is one module with a function `name_cause(case)`. All get the same trials, and all are
+Each peer is one module with a function `name_cause(case)`. All get the same data sets, and all are
 judged by the same number: the error of their final model when it simulates the held-out records.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 
 
 @dataclass(frozen=True)
@@ -20,15 +20,15 @@ class Case:
 
     Attributes:
         nominal: The model to start from, with its beliefs.
-        train: Trials to fit.
-        held: Trials to judge on.
+        train: Data sets to fit.
+        held: Data sets to judge on.
         machine: The machine itself, without what is hidden in it: for peers that are told the
             true rigid body and friction, as their row says.
     """
 
     nominal: Model
-    train: tuple[Trial, ...]
-    held: tuple[Trial, ...]
+    train: tuple[DataSet, ...]
+    held: tuple[DataSet, ...]
     machine: Model
 
 
@@ -38,7 +38,7 @@ class Answer:
 
     Attributes:
         cause: Standard name of the effect that it names first; empty for none.
-        error: chi2/N of its final model on the held-out trials.
+        error: chi2/N of its final model on the held-out data sets.
         strength: What it decided by, for tuning thresholds.
     """
 
@@ -54,7 +54,7 @@ def effects_for(case: Case) -> list[tuple[str, str | None]]:
     """
     model = case.nominal
     body, present = model.mechanism, {effect.label for effect in model.effects}
-    setups = [trial.setup for trial in (*case.train, *case.held)]
+    setups = [data_set.setup for data_set in (*case.train, *case.held)]
     found = []
     for name, effect in LIBRARY.items():
         known = set(effect.extra_inputs) <= {'time', *body.inputs}

@@ -19,7 +19,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.unknowns import unknowns_of
 from peers import Answer, Case, effects_for
 
@@ -30,32 +30,35 @@ FAR = 1e4  # residual in standard deviations where the simulation runs away
 
 
 class SimulationError:
-    """Residuals over noise of a model on trials, and their Jacobian.
+    """Residuals over noise of a model on data sets, and their Jacobian.
 
-    The unknowns are the coordinates of the model's parameters, then each trial's initial motion.
+    The unknowns are the coordinates of the model's parameters, then the initial motion of each
+    data set.
     """
 
-    def __init__(self, model: Model, trials: tuple[Trial, ...], horizon: float, fixed=False):
+    def __init__(self, model: Model, data_sets: tuple[DataSet, ...], horizon: float, fixed=False):
         self.model = model
         self.unknowns = () if fixed else unknowns_of(model)
-        self.trials, self.parts = trials, []
+        self.data_sets, self.parts = data_sets, []
         names = [u.name for u in self.unknowns]
-        for trial in trials:
-            compiled = compile_model(model, trial.setup)
+        for data_set in data_sets:
+            compiled = compile_model(model, data_set.setup)
             m2 = 2 * compiled.equations.coordinates
-            n = int(np.searchsorted(trial.time, horizon, side='right'))
-            u = trial.inputs_for(compiled.input_names)
+            n = int(np.searchsorted(data_set.time, horizon, side='right'))
+            u = data_set.inputs_for(compiled.input_names)
             column = [m2 + names.index(f) if f in names else -1 for f in compiled.free]
             places = [compiled.parameter_names.index(name) for name in names]
-            p = parameter_vector(model, trial.setup)
-            self.parts.append((trial, compiled, n, u[:n], np.array(column), places, p))
+            p = parameter_vector(model, data_set.setup)
+            self.parts.append((data_set, compiled, n, u[:n], np.array(column), places, p))
 
     def bounds(self):
         """Ranges of the unknowns."""
-        low = [u.to_coordinate(u.lower) if u.lower > 0 or not u.logarithmic else -np.inf
-               for u in self.unknowns]
+        low = [
+            u.to_coordinate(u.lower) if u.lower > 0 or not u.logarithmic else -np.inf
+            for u in self.unknowns
+        ]
         high = [u.to_coordinate(u.upper) for u in self.unknowns]
-        own = [np.inf] * sum(len(t.motion) for t in self.trials)
+        own = [np.inf] * sum(len(t.motion) for t in self.data_sets)
         return np.array(low + [-x for x in own]), np.array(high + own)
 
     def values(self, z):
@@ -65,14 +68,16 @@ class SimulationError:
     def __call__(self, z):
         """(residuals, Jacobian, of which so many are data); residuals FAR off the road."""
         k, values = len(self.unknowns), self.values(z)
-        chain = np.array([v if u.logarithmic else 1.0
-                          for u, v in zip(self.unknowns, values, strict=True)])
-        numbers = self.model.values | {u.name: v for u, v in
-                                       zip(self.unknowns, values, strict=True)}
+        chain = np.array(
+            [v if u.logarithmic else 1.0 for u, v in zip(self.unknowns, values, strict=True)]
+        )
+        numbers = self.model.values | {
+            u.name: v for u, v in zip(self.unknowns, values, strict=True)
+        }
         real = all(c > 0 for c in self.model.mechanism.consistency(numbers))
         rows, slopes, at = [], [], k
-        for trial, compiled, n, u, column, places, p in self.parts:
-            m2 = len(trial.motion)
+        for data_set, compiled, n, u, column, places, p in self.parts:
+            m2 = len(data_set.motion)
             motion = z[at : at + m2]
             p[places] = values
             x0, by_motion, by_free = compiled.initial_sensitivity(motion, u[0], p)
@@ -81,18 +86,25 @@ class SimulationError:
             for f, c in enumerate(column):
                 if c >= 0:
                     s0[:, c] = by_free[:, f]
-            seen = np.isfinite(trial.outputs[:n])
+            seen = np.isfinite(data_set.outputs[:n])
             ok = False
             if real:
                 normal, y, jacobian = compiled.normal(
-                    trial.time[:n], u, x0, s0, p, column, trial.outputs[:n], 1 / trial.sigma,
+                    data_set.time[:n],
+                    u,
+                    x0,
+                    s0,
+                    p,
+                    column,
+                    data_set.outputs[:n],
+                    1 / data_set.sigma,
                     keep=True,
-                )  # fmt: skip
+                )
                 ok = normal.rows == n and np.isfinite(jacobian).all()
             slope = np.zeros((seen.sum(), len(z)))
             if ok:
-                r = ((y - trial.outputs[:n]) / trial.sigma)[seen]
-                j = (jacobian / trial.sigma[:, None])[seen]
+                r = ((y - data_set.outputs[:n]) / data_set.sigma)[seen]
+                j = (jacobian / data_set.sigma[:, None])[seen]
                 slope[:, at : at + m2] = j[:, :m2]
                 slope[:, :k] = j[:, m2:] * chain
             else:
@@ -103,11 +115,11 @@ class SimulationError:
         data = sum(len(r) for r in rows)
         # What is believed: the initial motion as measured, the parameters as the file says.
         at = k
-        for trial in self.trials:
-            m2 = len(trial.motion)
-            rows.append((z[at : at + m2] - trial.motion) / trial.motion_sigma)
+        for data_set in self.data_sets:
+            m2 = len(data_set.motion)
+            rows.append((z[at : at + m2] - data_set.motion) / data_set.motion_sigma)
             slope = np.zeros((m2, len(z)))
-            slope[:, at : at + m2] = np.diag(1 / trial.motion_sigma)
+            slope[:, at : at + m2] = np.diag(1 / data_set.motion_sigma)
             slopes.append(slope)
             at += m2
         for i, u in enumerate(self.unknowns):
@@ -135,13 +147,13 @@ class Fitted:
 
 
 def minimise(
-    model: Model, trials, at=None, motions=None, horizon=np.inf, fixed=False
+    model: Model, data_sets, at=None, motions=None, horizon=np.inf, fixed=False
 ) -> Fitted:
     """least_squares from the values `at` and the motions, by default those measured."""
-    error = SimulationError(model, trials, horizon, fixed)
+    error = SimulationError(model, data_sets, horizon, fixed)
     at = at or {}
     start = [u.to_coordinate(at.get(u.name, u.prior)) for u in error.unknowns]
-    z0 = np.concatenate([start, *(motions or [trial.motion for trial in trials])])
+    z0 = np.concatenate([start, *(motions or [data_set.motion for data_set in data_sets])])
     low, high = error.bounds()
     last = {}
 
@@ -157,13 +169,13 @@ def minimise(
     )  # fmt: skip
     rows, _, data = evaluate(found.x)
     values = {u.name: v for u, v in zip(error.unknowns, error.values(found.x), strict=True)}
-    cuts = np.cumsum([len(error.unknowns), *(len(trial.motion) for trial in trials)])
+    cuts = np.cumsum([len(error.unknowns), *(len(data_set.motion) for data_set in data_sets)])
     return Fitted(values, np.split(found.x, cuts)[1:-1], float(rows[:data] @ rows[:data]), data)
 
 
-def held_error(model: Model, trials) -> float:
-    """chi2/N of a model on trials, of which only the initial motion is fitted."""
-    found = minimise(model, trials, fixed=True)
+def held_error(model: Model, data_sets) -> float:
+    """chi2/N of a model on data sets, of which only the initial motion is fitted."""
+    found = minimise(model, data_sets, fixed=True)
     return found.squared / found.samples
 
 
@@ -173,7 +185,7 @@ def first_start(name: str) -> dict[str, float]:
 
 
 def identify_nominal(case: Case) -> Fitted:
-    """The nominal model on the training trials: straight, or by way of a short horizon."""
+    """The nominal model on the training data sets: straight, or by way of a short horizon."""
     straight = minimise(case.nominal, case.train)
     lead = minimise(case.nominal, case.train, horizon=FIRST_S)
     led = minimise(case.nominal, case.train, lead.values, lead.motions)

@@ -14,7 +14,7 @@ from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.identification.data_set import Trial, sensor_matrix
+from cg_sysid.identification.data_set import DataSet, sensor_matrix
 
 WINDOW = 31  # samples
 DEGREE = 4
@@ -91,65 +91,76 @@ def late(u, delay, step):
 
 
 class Measured:
-    """One trial, and the rows that it is to a hypothesis."""
+    """One data set, and the rows that it is to a hypothesis."""
 
-    def __init__(self, body: Mechanism, trial: Trial):
-        self.trial = trial
-        self.step = float(np.median(np.diff(trial.time)))
-        c = sensor_matrix(body, trial.setup)
+    def __init__(self, body: Mechanism, data_set: DataSet):
+        self.data_set = data_set
+        self.step = float(np.median(np.diff(data_set.time)))
+        c = sensor_matrix(body, data_set.setup)
         m = c.shape[1] // 2
         self.matrix = c
         angles = np.array([unit == 'rad' for unit in body.output_units])
-        seen = np.isfinite(trial.outputs).any(axis=0)
+        seen = np.isfinite(data_set.outputs).any(axis=0)
         self.angles, self.rates = np.flatnonzero(angles & seen), np.flatnonzero(~angles & seen)
-        gain = [np.linalg.norm(savgol_coeffs(WINDOW, DEGREE, deriv=d, delta=self.step))
-                for d in range(3)]
-        sa, sr = trial.sigma[self.angles], trial.sigma[self.rates]
+        gain = [
+            np.linalg.norm(savgol_coeffs(WINDOW, DEGREE, deriv=d, delta=self.step))
+            for d in range(3)
+        ]
+        sa, sr = data_set.sigma[self.angles], data_set.sigma[self.rates]
         self.c = [c[self.angles][:, :m], c[self.rates][:, m:]]
-        self.noise = [sa * gain[0], np.r_[sa * gain[1], sr * gain[0]],
-                      np.r_[sa * gain[2], sr * gain[1]]]
+        self.noise = [
+            sa * gain[0],
+            np.r_[sa * gain[1], sr * gain[0]],
+            np.r_[sa * gain[2], sr * gain[1]],
+        ]
         self.maps = [self.c[0], np.vstack(self.c), np.vstack(self.c)]
-        self.solvers = [np.linalg.pinv(a / n[:, None]) / n
-                        for a, n in zip(self.maps, self.noise, strict=True)]
+        self.solvers = [
+            np.linalg.pinv(a / n[:, None]) / n for a, n in zip(self.maps, self.noise, strict=True)
+        ]
 
     def motion(self, outputs, window=WINDOW):
         """Coordinates and rates (n, 2m) from outputs, and the smoothed channels."""
+
         def smooth(values, derivative):
             return savgol_filter(values, window, DEGREE, derivative, self.step, axis=0)
 
         a, r = outputs[:, self.angles], outputs[:, self.rates]
-        levels = [smooth(a, 0),
-                  np.hstack([smooth(a, 1), smooth(r, 0)]),
-                  np.hstack([smooth(a, 2), smooth(r, 1)])]
+        levels = [
+            smooth(a, 0),
+            np.hstack([smooth(a, 1), smooth(r, 0)]),
+            np.hstack([smooth(a, 2), smooth(r, 1)]),
+        ]
         s, ds = (x @ solver.T for x, solver in zip(levels[:2], self.solvers[:2], strict=True))
         return np.hstack([s, ds]), levels
 
     def rows(self, model: Model) -> np.ndarray:
         """Everything that the hypothesis leaves unexplained, in standard deviations."""
-        trial, equations = self.trial, along(model, self.trial.setup)
-        p = parameter_vector(model, trial.setup)
+        data_set, equations = self.data_set, along(model, self.data_set.setup)
+        p = parameter_vector(model, data_set.setup)
         input_delay, output_delays = (np.asarray(d).ravel() for d in equations.delays(p))
         # What delays all sensors is an early torque. A held torque changes at a row, where a
         # smoothed acceleration sees half of the change.
         common = output_delays.min()
-        u = late(trial.inputs_for(equations.inputs), input_delay[0] + common + self.step / 2,
+        u = late(data_set.inputs_for(equations.inputs), input_delay[0] + common + self.step / 2,
                  self.step)  # fmt: skip
-        measured = filled(trial.outputs)
+        measured = filled(data_set.outputs)
         # Corrections of sensors come from motion that is smoothed more: with the noise of the
         # target in it a column would seem to explain that noise.
         sensors = any(effect.place in ('sensor', 'timing') for effect in model.effects)
         motion, _ = self.motion(measured, 3 * WINDOW if sensors else WINDOW)
-        z = equations.extra_states(trial.time, motion, u, p)
+        z = equations.extra_states(data_set.time, motion, u, p)
         _, reported = self._read(equations, np.hstack([motion, z]), u, p)
         ideal = motion @ self.matrix.T
         for j, delay in enumerate(output_delays - common):
-            reported[:, j] = np.interp(trial.time - delay, trial.time, reported[:, j])
+            reported[:, j] = np.interp(data_set.time - delay, data_set.time, reported[:, j])
         motion, levels = self.motion(measured - (reported - ideal))
         acceleration, _ = self._read(equations, np.hstack([motion, z]), u, p)
         smooth = savgol_filter(acceleration, WINDOW, DEGREE, axis=0)
         expected = [motion[:, : equations.m], motion[:, equations.m :], smooth]
-        left = [(level - x @ a.T) / n for level, x, a, n in
-                zip(levels, expected, self.maps, self.noise, strict=True)]
+        left = [
+            (level - x @ a.T) / n
+            for level, x, a, n in zip(levels, expected, self.maps, self.noise, strict=True)
+        ]
         return np.hstack(left)[2 * WINDOW : -2 * WINDOW : KEEP].ravel()
 
     @staticmethod

@@ -175,6 +175,7 @@ def natives(case: Case) -> list[list[Native]]:
     found = [[n] for n in NATIVE if n.effect in LIBRARY and n.effect not in present]
     for leg in ('inner', 'outer'):
         for distance in (0.2, 0.6, 1.0):
+
             def load(spec, z, leg=leg):
                 put_body(spec.body(f'load_{leg}'), max(0.5 * z[0], 1e-9), z[1], 1e-12)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 
 CHANNELS = ('imu_angle', 'imu_rate', 'hip_angle')
 # Constraint dry friction is linear below a slip rate and constant above; at this width and
@@ -117,24 +117,24 @@ def soften(compiled: mujoco.MjModel) -> mujoco.MjModel:
     return compiled
 
 
-def start_of(model, trial: Trial, motion: np.ndarray) -> np.ndarray:
+def start_of(model, data_set: DataSet, motion: np.ndarray) -> np.ndarray:
     """Initial state from the free coordinates and rates; a filter starts settled."""
     half = len(motion) // 2
 
     def joints(x):
         if half == 1:
             return [x[0], x[0] / 2]
-        standing, swinging = x if trial.setup.stance == 'inner' else x[::-1]
+        standing, swinging = x if data_set.setup.stance == 'inner' else x[::-1]
         return [standing, swinging - standing, (swinging - standing) / 2]
 
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = joints(motion[:half]), joints(motion[half:])
     driven = model.actuator('motor')
     if driven.actnum[0]:
-        data.act[driven.actadr[0]] = trial.inputs[0, 0]
+        data.act[driven.actadr[0]] = data_set.inputs[0, 0]
     for i in np.flatnonzero(model.actuator_history[:, 0]):
         n = model.actuator_history[i, 0]
-        mujoco.mj_initCtrlHistory(model, data, i, None, np.full(n, trial.inputs[0, 0]))
+        mujoco.mj_initCtrlHistory(model, data, i, None, np.full(n, data_set.inputs[0, 0]))
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     return state

@@ -16,7 +16,7 @@ from absl import logging
 from mujoco import sysid
 
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from peers import Answer, Case
 from peers.mujoco_natives import Native, natives
 from peers.mujoco_robot import CHANNELS, channels_of, mjcf, put_inertias, soften, start_of
@@ -39,21 +39,21 @@ class Problem:
     `motion`, the initial motions, in their standard deviations; `native`.
     """
 
-    def __init__(self, nominal: Model, trials: Sequence[Trial], horizon=np.inf,
+    def __init__(self, nominal: Model, data_sets: Sequence[DataSet], horizon=np.inf,
                  native: Native | None = None):  # fmt: skip
-        self.nominal, self.trials, self.native = nominal, trials, native
+        self.nominal, self.data_sets, self.native = nominal, data_sets, native
         self.believed = [n for n in ('c1', 'c2', 'c3', 'c4', 'c5', 'c6',
                                      'viscous_friction.coefficient', 'coulomb_friction.torque')
                          if n in nominal.quantities]  # fmt: skip
-        self.rows = [int(np.searchsorted(t.time, horizon, side='right')) for t in trials]
-        self.residuals = [self._residual(i) for i in range(len(trials))]
+        self.rows = [int(np.searchsorted(t.time, horizon, side='right')) for t in data_sets]
+        self.residuals = [self._residual(i) for i in range(len(data_sets))]
         self.samples = sum(np.isfinite(t.outputs[1:n]).sum()
-                           for t, n in zip(trials, self.rows, strict=True))  # fmt: skip
+                           for t, n in zip(data_sets, self.rows, strict=True))  # fmt: skip
 
     def parameters(self, base=None, motion=None, fixed=False) -> sysid.ParameterDict:
         """All unknowns, at zero or at these values."""
         made = sysid.ParameterDict()
-        k, m = len(self.believed), sum(len(t.motion) for t in self.trials)
+        k, m = len(self.believed), sum(len(t.motion) for t in self.data_sets)
         made.add(sysid.Parameter('base', np.zeros(k), -6 * np.ones(k), 6 * np.ones(k),
                                  modifier=self._write_base, frozen=False))  # fmt: skip
         made.add(sysid.Parameter('motion', np.zeros(m), -100 * np.ones(m), 100 * np.ones(m)))
@@ -86,15 +86,15 @@ class Problem:
             self.native.write(spec, parameter.value)
 
     def _residual(self, i):
-        trial, n = self.trials[i], self.rows[i]
-        step = float(np.median(np.diff(trial.time)))
-        spec = mujoco.MjSpec.from_string(mjcf(self.nominal, trial.setup, step))
+        data_set, n = self.data_sets[i], self.rows[i]
+        step = float(np.median(np.diff(data_set.time)))
+        spec = mujoco.MjSpec.from_string(mjcf(self.nominal, data_set.setup, step))
         start = self.parameters()
         time = np.arange(n) * step
         mapping = {c: (sysid.SignalType.CustomObs, np.array([k])) for k, c in enumerate(CHANNELS)}
-        measured = sysid.TimeSeries(time[1:], trial.outputs[1:n], mapping)
-        at = sum(len(t.motion) for t in self.trials[:i])
-        own = slice(at, at + len(trial.motion))
+        measured = sysid.TimeSeries(time[1:], data_set.outputs[1:n], mapping)
+        at = sum(len(t.motion) for t in self.data_sets[:i])
+        own = slice(at, at + len(data_set.motion))
 
         def build(parameters, spec):
             # Frozen ones too, which the toolbox leaves out.
@@ -104,25 +104,31 @@ class Problem:
 
         def rollout(*, models, datas, control_signal, initial_states, param_dicts, **rest):
             states = [
-                start_of(model, trial, trial.motion + p['motion'].value[own] * trial.motion_sigma)
+                start_of(
+                    model,
+                    data_set,
+                    data_set.motion + p['motion'].value[own] * data_set.motion_sigma,
+                )
                 for model, p in zip(models, param_dicts, strict=True)
             ]
             return sysid.sysid_rollout(models=models, datas=datas, control_signal=control_signal,
                                        initial_states=states, **rest)  # fmt: skip
 
         def residual(parameters, predicted, measured, model, return_pred_all, state=None, **_):
-            simulated = sysid.TimeSeries(time[1:], channels_of(model, trial.setup, state), mapping)
+            simulated = sysid.TimeSeries(
+                time[1:], channels_of(model, data_set.setup, state), mapping
+            )
             if self.native and self.native.read:
                 simulated = self.native.read(simulated, parameters['native'].value)
-            r = np.nan_to_num((simulated.data - measured.data) / trial.sigma, nan=FAR)
+            r = np.nan_to_num((simulated.data - measured.data) / data_set.sigma, nan=FAR)
             r = np.where(np.isfinite(measured.data), r.clip(-FAR, FAR), 0.0)
             return r, simulated, measured
 
         model = build(start, spec)
         torque = np.zeros((n, model.nu))
-        torque[:, 0] = trial.inputs[:n, 0]
+        torque[:, 0] = data_set.inputs[:n, 0]
         sequence = sysid.ModelSequences(
-            trial.name, spec, trial.name, start_of(model, trial, trial.motion),
+            data_set.name, spec, data_set.name, start_of(model, data_set, data_set.motion),
             sysid.TimeSeries(time, torque), measured, allow_missing_sensors=True,
         )  # fmt: skip
         return sysid.build_residual_fn(
@@ -131,12 +137,12 @@ class Problem:
         )  # fmt: skip
 
     def __call__(self, x, parameters):
-        """Residuals of all trials, then of the beliefs."""
+        """Residuals of all data sets, then of the beliefs."""
         base = 0 if parameters['base'].frozen else len(self.believed)
-        motions = np.cumsum([base, *(len(t.motion) for t in self.trials)])
+        motions = np.cumsum([base, *(len(t.motion) for t in self.data_sets)])
         parts, predicted, measured = [], [], []
         for i, residual in enumerate(self.residuals):
-            # Columns that differ in the motion of other trials only are one and the same.
+            # Columns that differ in the motion of other data sets only are one and the same.
             mine = np.array(x, float)
             mine[base : motions[i]] = mine[motions[i + 1] : motions[-1]] = 0.0
             if x.ndim == 1:
@@ -224,7 +230,7 @@ def name_cause(case: Case) -> Answer:
 
 
 def held_error(final: Problem, fitted, case: Case) -> float:
-    """chi2/N on the held-out trials, of which only the initial motion is fitted."""
+    """chi2/N on the held-out data sets, of which only the initial motion is fitted."""
     held = Problem(case.nominal, case.held, native=final.native)
     parameters = held.parameters(fitted['base'].value)
     parameters['base'].frozen = True

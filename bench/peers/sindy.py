@@ -47,7 +47,7 @@ def starts(name: str) -> list[dict[str, float]]:
 
 @dataclass(frozen=True)
 class Term:
-    """An effect at one of its starts, and what it would add to the rows of the training trials."""
+    """An effect at one of its starts, and what it would add to the training rows."""
 
     name: str
     at: str | None
@@ -73,13 +73,13 @@ class Term:
         return model.with_effect(self.name, self.at, **values)
 
 
-def stacked(model: Model, trials: list[Measured]) -> np.ndarray:
-    """Rows of several trials."""
-    return np.concatenate([trial.rows(model) for trial in trials])
+def stacked(model: Model, data_sets: list[Measured]) -> np.ndarray:
+    """Rows of several data sets."""
+    return np.concatenate([data_set.rows(model) for data_set in data_sets])
 
 
 def terms_of(case: Case, base: Model, train: list[Measured], target: np.ndarray) -> list[Term]:
-    """The library of candidate functions along the training trials."""
+    """The library of candidate functions along the training data sets."""
     found = []
     for name, at in effects_for(case):
         for start in starts(name):
@@ -113,21 +113,21 @@ def name_cause_told(case: Case) -> Answer:
 def name_cause(case: Case, told: bool = False) -> Answer:
     """Regress, choose the number of terms on held-out rows, name the term that explains most."""
     body = case.nominal.mechanism
-    train = [Measured(body, trial) for trial in case.train]
-    held = [Measured(body, trial) for trial in case.held]
+    train = [Measured(body, data_set) for data_set in case.train]
+    held = [Measured(body, data_set) for data_set in case.held]
     base = case.machine if told else case.nominal.with_values(identify_nominal(case).values)
     target, judged = stacked(base, train), stacked(base, held)
     terms = terms_of(case, base, train, target)
     beliefs = [] if told else [u for u in unknowns_of(case.nominal) if np.isfinite(u.tolerance)]
 
-    def by_beliefs(trials, rows):
+    def by_priors(data_sets, rows):
         moved = [base.with_values({u.name: base.values[u.name] + NUDGE * u.tolerance})
                  for u in beliefs]  # fmt: skip
-        columns = [(rows - stacked(model, trials)) / NUDGE for model in moved]
+        columns = [(rows - stacked(model, data_sets)) / NUDGE for model in moved]
         return np.column_stack(columns) if columns else np.zeros((len(rows), 0))
 
     # What the believed parameters can explain, within their tolerances, is taken out first.
-    lumps = by_beliefs(train, target)
+    lumps = by_priors(train, target)
     k = lumps.shape[1]
     q, r = np.linalg.qr(np.vstack([lumps, np.eye(k)]))
     wide = np.column_stack([*(term.column for term in terms), target])
@@ -143,7 +143,7 @@ def name_cause(case: Case, told: bool = False) -> Answer:
     optimiser.fit(library / norms, left[:, None])
     # Its own choice of the number of terms takes the step that explained least: we choose.
     path = [coefficients.ravel() / norms for coefficients in optimiser.history_[1:]]
-    judged_lumps = by_beliefs(held, judged)
+    judged_lumps = by_priors(held, judged)
     before = float(judged @ judged)
     best = (0.0, None, None)
     for sizes in path:

@@ -93,9 +93,7 @@ def balance_nodes(options: BalanceOptions) -> dict[str, NodeOf]:
     }
 
 
-def carry_out(
-    program: str, nodes: dict[str, NodeOf], judge: Callable[[Outcome], Verdict]
-) -> int:
+def carry_out(program: str, nodes: dict[str, NodeOf], judge: Callable[[Outcome], Verdict]) -> int:
     """Run the nodes until the machine has finished, and end with one line of how it went.
 
     Args:

@@ -167,9 +167,7 @@ def main(args: list[str] | None = None) -> int:
     console.print(f'[bold]Demonstration[/], seed {seed}: a machine with a secret')
     try:
         with stopped_by_signals():
-            run_demo(
-                options.effect, seed, out, options.duration, console, options.candidates
-            )
+            run_demo(options.effect, seed, out, options.duration, console, options.candidates)
     except (ValueError, RuntimeError, OSError) as error:
         console.print(f'error: {error}', markup=False, style='red')
         return 1

@@ -159,9 +159,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument(
         '--grown-for', default='', help='model of the tree, where --model knows more [--model]'
     )
-    parser.add_argument(
-        '--tree', default=default.tree, help=f'a file or a name [{default.tree}]'
-    )
+    parser.add_argument('--tree', default=default.tree, help=f'a file or a name [{default.tree}]')
     parser.add_argument('--start', choices=STARTS, default='tree', help='[tree]')
     parser.add_argument('--stance', choices=STANCES, default='inner', help='upright: [inner]')
     parser.add_argument('--mode', choices=MODES, default='real_time', help='[real_time]')
@@ -181,9 +179,7 @@ def main(args: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f'recover_balance: {error}', file=sys.stderr)
         return 2
-    return carry_out(
-        'recover_balance', nodes, lambda o: recovery_verdict(o, options.pushes)
-    )
+    return carry_out('recover_balance', nodes, lambda o: recovery_verdict(o, options.pushes))
 
 
 if __name__ == '__main__':

@@ -99,9 +99,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument(
         '--grown-for', default='', help='model of the tree, where --model knows more [--model]'
     )
-    parser.add_argument(
-        '--tree', default=default.tree, help=f'a file or a name [{default.tree}]'
-    )
+    parser.add_argument('--tree', default=default.tree, help=f'a file or a name [{default.tree}]')
     parser.add_argument(
         '--speed', type=float, default=default.speed, help=f'm/s [{default.speed}]'
     )

@@ -122,8 +122,12 @@ def test_lock_step_balances_and_repeats_to_the_bit(loop):
         ('safety_gate', signal.SIGSTOP),
     ],
     ids=[
-        'observer dies', 'controller dies', 'gate dies',
-        'observer hangs', 'controller hangs', 'gate hangs',
+        'observer dies',
+        'controller dies',
+        'gate dies',
+        'observer hangs',
+        'controller hangs',
+        'gate hangs',
     ],
 )
 def test_torque_is_zero_20_ms_after_a_node_is_gone(loop, victim, by):

@@ -20,7 +20,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_estimation.high_gain import HighGainObserver
-from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.loading import load_bags
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.records.bags import write_bag
@@ -59,23 +59,23 @@ def learnt(tmp_path_factory):
     done = [walked(nominal, robot, *walk) for walk in WALKS]
     folder = tmp_path_factory.mktemp('walks')
     bags = [write_bag(folder / record.name, record) for _, record in done]
-    intake = take_in(bags, MODEL_FILE)
+    loaded = load_bags(bags, MODEL_FILE)
     options = Options(effects=CANDIDATES, workers=1)
-    found = diagnose(nominal, intake.records, options, landings=intake.landings)
-    return [run for run, _ in done], intake, found
+    found = diagnose(nominal, loaded.records, options, landings=loaded.landings)
+    return [run for run, _ in done], loaded, found
 
 
 @pytest.mark.slow
 def test_every_step_of_the_walk_is_found_where_it_was(learnt):
-    runs, intake, _ = learnt
-    assert not intake.left_out
-    for source in intake.sources:
+    runs, loaded, _ = learnt
+    assert not loaded.left_out
+    for source in loaded.sources:
         assert 'closed_loop' in {finding.code for finding in source.check.findings}
-    for source, run in zip(intake.sources, runs, strict=True):
+    for source, run in zip(loaded.sources, runs, strict=True):
         true = run.time[1:][np.diff(run.standing) != 0]
         found = [
-            landing.touchdown.time for landing in intake.landings
-            if intake.origin[landing.record.name] == source.name
+            landing.touchdown.time for landing in loaded.landings
+            if loaded.origin[landing.record.name] == source.name
         ]  # fmt: skip
         assert len(true) >= 4
         # A few samples, as on slopes (test_phases.py).

@@ -142,9 +142,7 @@ class BalanceNode(Node):
         """Note how old the measurement was when its torque was latched."""
         if len(message.effort) == 1:
             deadline = self.declared.values.deadline
-            self._ages.latched(
-                to_nanoseconds(message.header.stamp), message.effort[0], deadline
-            )
+            self._ages.latched(to_nanoseconds(message.header.stamp), message.effort[0], deadline)
 
     def poll(self) -> float:
         """Take over what was sampled, say once a second how it goes."""

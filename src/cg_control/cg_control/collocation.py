@@ -103,11 +103,13 @@ def softened(model: Model, labels: tuple[str, ...] | None = None) -> Model:
         labels: Of the effects that are softened; None: all.
     """
     beginnings = tuple(f'{label}.' for label in labels or ())
-    return model.with_values({
-        name: max(model.values[name], SOFT_TRANSITION)
-        for name, parameter in model.declarations.items()
-        if parameter.smoothing and (labels is None or name.startswith(beginnings))
-    })
+    return model.with_values(
+        {
+            name: max(model.values[name], SOFT_TRANSITION)
+            for name, parameter in model.declarations.items()
+            if parameter.smoothing and (labels is None or name.startswith(beginnings))
+        }
+    )
 
 
 @dataclass(frozen=True)

@@ -189,9 +189,7 @@ class Extension:
             goal = Stretch.along(nodes, node)
             yield self._attempt(nodes, np.asarray(goal.node), (STANCES[leg],), goal, x)
 
-    def _onto_orbits(
-        self, nodes: Nodes, leg: int, x: np.ndarray, steps: int
-    ) -> Iterator[Attempt]:
+    def _onto_orbits(self, nodes: Nodes, leg: int, x: np.ndarray, steps: int) -> Iterator[Attempt]:
         near = nearest_orbits(nodes, leg, x)[: self.options.orbits]
         for count in range(steps, self.options.orbit_steps + 1):
             modes = tuple(STANCES[(leg + k) % 2] for k in range(count + 1))

@@ -234,9 +234,7 @@ def _planted(
     )  # fmt: skip
 
 
-def walking_champions(
-    preview: Preview, leg: np.ndarray, x: np.ndarray, count: int
-) -> np.ndarray:
+def walking_champions(preview: Preview, leg: np.ndarray, x: np.ndarray, count: int) -> np.ndarray:
     """Champions of a tree that walks: those it has, then those to orbits, then some to upright.
 
     Args:
@@ -266,9 +264,7 @@ def _drawn(onto: Tree | None) -> dict[str, Any]:
     return {'box': list(BOX), 'around': list(AROUND), 'onto': dict(onto.provenance)}
 
 
-def _require_same(
-    saved: Checkpoint, here: Checkpoint, samples: int, path: Path | None
-) -> None:
+def _require_same(saved: Checkpoint, here: Checkpoint, samples: int, path: Path | None) -> None:
     """Refuse to go on from what would not become the tree that is asked for; else say so."""
     done = saved.counts.samples
     try:

@@ -223,7 +223,11 @@ class Grower:
         return Counts(**{k: v - getattr(before, k) for k, v in vars(self.counts).items()})
 
     def _not_brought_home(
-        self, rows: np.ndarray, leg: np.ndarray, x: np.ndarray, walking: np.ndarray,
+        self,
+        rows: np.ndarray,
+        leg: np.ndarray,
+        x: np.ndarray,
+        walking: np.ndarray,
         entries: np.ndarray | None = None,
     ) -> np.ndarray:
         """Those of the rows that a preview brings home from none of its entries, or of these.

@@ -48,9 +48,7 @@ class Levels:
         """With room for so many nodes."""
         rows = count - len(self.home)
         more = np.zeros((rows, BINS + 1), np.int32)
-        return Levels(
-            self.tolerated, np.vstack([self.home, more]), np.vstack([self.failed, more])
-        )
+        return Levels(self.tolerated, np.vstack([self.home, more]), np.vstack([self.failed, more]))
 
     def add(self, node: np.ndarray, cost: np.ndarray, home: np.ndarray) -> None:
         """Count robots that came by: nodes, costs there, whether they came home, all (m,)."""

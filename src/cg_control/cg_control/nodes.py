@@ -148,9 +148,7 @@ class Nodes:
         last = trajectory.phases[-1]
         gain = last.gains[-1] if balance is None else balance
         compensate = trajectory.provenance.get('friction') == 'to be compensated'
-        root = cls.root(
-            last.stance, gain, last.cost_to_go[-1], trajectory.model_hash, compensate
-        )
+        root = cls.root(last.stance, gain, last.cost_to_go[-1], trajectory.model_hash, compensate)
         return root.grafted(trajectory, model, 0, late=late)
 
     @classmethod
@@ -300,9 +298,9 @@ class Nodes:
             other,
             next=np.where(other.next < 0, -1, other.next + n).astype(np.int32),
             landing=np.where(other.landing < 0, -1, other.landing + n).astype(np.int32),
-            branch=np.where(
-                other.branch == 0, 0, other.branch + self.branch.max()
-            ).astype(np.int32),
+            branch=np.where(other.branch == 0, 0, other.branch + self.branch.max()).astype(
+                np.int32
+            ),
         )
         return _concatenated([self, moved])
 
@@ -550,8 +548,15 @@ def _concatenated(parts: list[Nodes]) -> Nodes:
 
 
 def _chained(
-    trajectory: Trajectory, model: Model, tree: Nodes, number: int, place: int, landing: int,
-    forms: Sequence[np.ndarray] | None, late: float, onto: int | None = None,
+    trajectory: Trajectory,
+    model: Model,
+    tree: Nodes,
+    number: int,
+    place: int,
+    landing: int,
+    forms: Sequence[np.ndarray] | None,
+    late: float,
+    onto: int | None = None,
 ) -> list[Nodes]:
     """The nodes of each phase; the first gets index `place`.
 
@@ -578,8 +583,13 @@ def _chained(
 
 
 def _block(
-    phase: Phase, number: int, tree: Nodes, funnel: np.ndarray,
-    time: np.ndarray, states: np.ndarray, rates: np.ndarray,
+    phase: Phase,
+    number: int,
+    tree: Nodes,
+    funnel: np.ndarray,
+    time: np.ndarray,
+    states: np.ndarray,
+    rates: np.ndarray,
 ) -> Nodes:
     """The nodes of a phase and of what follows while its impact is late; `next` is from 0 on."""
     m, n = len(phase.time), len(phase.time) + len(time)

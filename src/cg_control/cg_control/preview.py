@@ -100,9 +100,7 @@ class Preview:
             found[rows] = some[rows, home[rows].argmax(axis=1)]
         return found
 
-    def candidates(
-        self, leg: np.ndarray, x: np.ndarray, walking: bool = False
-    ) -> np.ndarray:
+    def candidates(self, leg: np.ndarray, x: np.ndarray, walking: bool = False) -> np.ndarray:
         """Entries to try, in order: the least deep ones, the champions.
 
         Where the robot is to walk the least deep nodes of orbits come first, then what else leads

@@ -314,12 +314,14 @@ def _costs_to_go(task: Task) -> np.ndarray:
     assert isinstance(goal, Stretch)
     a, b, h = goal.edges[:, 0, 0], goal.edges[:, 1, 0], goal.span
     # u0 = a + b t; minus the integral of effort u0^2 + time.
-    powers = -np.column_stack([
-        np.zeros(len(h)),
-        task.effort * a**2 + task.time,
-        task.effort * a * b,
-        task.effort * b**2 / 3,
-    ])
+    powers = -np.column_stack(
+        [
+            np.zeros(len(h)),
+            task.effort * a**2 + task.time,
+            task.effort * a * b,
+            task.effort * b**2 / 3,
+        ]
+    )
     spent = (powers * h[:, None] ** np.arange(4.0)).sum(axis=1)
     powers[:, 0] = -np.cumsum(spent[::-1])[::-1]
     return powers

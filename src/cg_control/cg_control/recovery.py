@@ -417,9 +417,7 @@ class TreeController:
         self._torque = min(max(torque, -limit), limit)
         return Command(self._torque, FOLLOWING)
 
-    def _onto(
-        self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim, here: float
-    ) -> int:
+    def _onto(self, stamp_ns: int, stance: str, x: np.ndarray, best: Claim, here: float) -> int:
         """The node to go over to, STAY or NOWHERE, by (SWITCH) and (PREVIEW)."""
         if self.settings.preview and here > 1.0:  # NaN, where no depth is said, is not
             return self._previewed(stamp_ns, stance, x, best)

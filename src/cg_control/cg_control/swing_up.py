@@ -203,7 +203,5 @@ class SwingUp:
         (phase,), R = motion.phases, np.array([[self.options.R]])
         _, funnel = riccati(self._plant, phase, FUNNEL * self.options.Q, R, nodes.F[0])
         gains, S = riccati(self._plant, phase, self.options.Q, R, nodes.S[0])
-        phase = Phase(
-            phase.stance, phase.time, phase.states, phase.rates, phase.torque, gains, S
-        )
+        phase = Phase(phase.stance, phase.time, phase.states, phase.rates, phase.torque, gains, S)
         return Branch(motion.with_phases((phase,)), 0, funnels=(funnel,))

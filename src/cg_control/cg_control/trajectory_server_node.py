@@ -68,9 +68,7 @@ class TrajectoryServerNode(Node):
         self.trajectory: Trajectory | None = None
         self.problem = 'nothing selected yet'
         self._selected: ServerSettings | None = None
-        self.nominal = self.create_publisher(
-            JointTrajectory, '/trajectory/nominal', LATCHED_QOS
-        )
+        self.nominal = self.create_publisher(JointTrajectory, '/trajectory/nominal', LATCHED_QOS)
         self.selected = self.create_publisher(String, '/trajectory/selected', LATCHED_QOS)
         self.order = self.create_publisher(JointTrajectory, '/trajectory', SENSOR_QOS)
         for name, answer in (('start', self.on_start), ('stop', self.on_stop),

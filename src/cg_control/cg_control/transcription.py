@@ -162,9 +162,7 @@ class Block:
         state = z[:nx]
         rows, cost = self.function(z, p)
         beside = ca.DM.zeros(len(start.names), controls)
-        jacobian = ca.vertcat(
-            self.jacobian(z, p), ca.horzcat(start.jacobian(state, p), beside)
-        )
+        jacobian = ca.vertcat(self.jacobian(z, p), ca.horzcat(start.jacobian(state, p), beside))
         bent = start.hessian(state, p, factor, multipliers[own:])
         hessian = self.hessian(z, p, factor, multipliers[:own]) + ca.diagcat(
             bent, ca.DM.zeros(controls, controls)
@@ -266,9 +264,7 @@ class Transcription:
         self.parameter_count = self.model_parameters + len(TASK_PARAMETERS) + goal
         self._symbols = ca.SX.sym('p', self.parameter_count + 1)
         # All but what the last block alone needs.
-        self._shared = ca.vertcat(
-            self._symbols[: self.parameter_count - goal], self._symbols[-1]
-        )
+        self._shared = ca.vertcat(self._symbols[: self.parameter_count - goal], self._symbols[-1])
         self._model, rubbing = model, model
         for effect in model.effects:
             if effect.label in structure.given_back:
@@ -283,9 +279,7 @@ class Transcription:
     def _parameters(self) -> tuple[ca.SX, dict[str, ca.SX]]:
         task = self._symbols[self.model_parameters : -1]
         self._goal = task[len(TASK_PARAMETERS) :]
-        named = dict(
-            zip(TASK_PARAMETERS, ca.vertsplit(task[: len(TASK_PARAMETERS)]), strict=True)
-        )
+        named = dict(zip(TASK_PARAMETERS, ca.vertsplit(task[: len(TASK_PARAMETERS)]), strict=True))
         return self._symbols[: self.model_parameters], named
 
     def _parameters_of(self, model: Model) -> ca.SX:
@@ -334,9 +328,7 @@ class Transcription:
         x, a, u, T = s[:4], s[4:6], s[6], s[7]
         x_next, a_next, u_next = w[:4], w[4:6], w[6]
         h = T / self._symbols[-1]
-        x_c = (x + x_next) / 2 + h / 8 * (
-            ca.vertcat(x[2:], a) - ca.vertcat(x_next[2:], a_next)
-        )
+        x_c = (x + x_next) / 2 + h / 8 * (ca.vertcat(x[2:], a) - ca.vertcat(x_next[2:], a_next))
         a_c = 1.5 / h * (x_next[2:] - x[2:]) - (a + a_next) / 4
         move = x_next[:2] - x[:2] - h / 6 * (x[2:] + 4 * x_c[2:] + x_next[2:])
         rows = [
@@ -398,9 +390,7 @@ class Transcription:
         w = ca.DM([*UNITS[4:], 1.0]) * scaled[self.nx :]
         p = self._parameters_of(self._model)
         v_plus, rows, miss = self._landing(s, mode)
-        after = self._inverse_dynamics(other(mode))(
-            ca.vertcat(s[:2], v_plus), w[:2], w[2], p
-        )
+        after = self._inverse_dynamics(other(mode))(ca.vertcat(s[:2], v_plus), w[:2], w[2], p)
         rows.append(('dynamics', after, 0.0, 0.0))
         rows += self._motor(ca.vertcat(s[:2], v_plus), w[2])
         # The next state enters linearly; the rows of the gap come first and hold it back.
@@ -532,10 +522,7 @@ class Transcription:
             L = ca.reshape(lam_g[row : row + count * height], height, count)[fill:, :]
             shared = block.function.size1_in(1) - 1
             P = ca.repmat(ca.vertcat(p[:shared], run.intervals), 1, count)
-            mapped = [
-                fn if count == 1 else fn.map(count)
-                for fn in block.functions
-            ]
+            mapped = [fn if count == 1 else fn.map(count) for fn in block.functions]
             values, cost = mapped[0](Z, P)
             f += ca.sum2(cost)
             if kind == 'knot':

@@ -97,9 +97,7 @@ class TvlqrNode(Node):
         self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         self.create_subscription(JointState, topics.STATE, self.on_state, SENSOR_QOS)
-        self.create_subscription(
-            String, '/trajectory/selected', self.on_selected, LATCHED_QOS
-        )
+        self.create_subscription(String, '/trajectory/selected', self.on_selected, LATCHED_QOS)
         self.create_subscription(JointTrajectory, '/trajectory', self.on_order, SENSOR_QOS)
         self.add_on_set_parameters_callback(self._judge)
         self.started = True

@@ -122,7 +122,7 @@ class VirtualConstraints:
         st = STANCES.index(stance)
         h, slope, curvature = self.constraints[stance].at(x[:, st])
         y, dy = x[:, 1 - st] - h, x[:, 3 - st] - slope * x[:, 2 + st]
-        wanted = -self.bandwidth**2 * y - 2 * self.bandwidth * dy
+        wanted = -(self.bandwidth**2) * y - 2 * self.bandwidth * dy
         drift = idle[:, 3 - st] - slope * idle[:, 2 + st] - curvature * x[:, 2 + st] ** 2
         grip = _grip(stance, slope, pushed - idle)
         # Far from the orbit the torque may lose its grip: what is left is bounded by the limit.

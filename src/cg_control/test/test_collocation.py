@@ -276,9 +276,7 @@ def test_a_motion_ends_where_joining_the_branch_is_cheapest(robot, branch):
             except PlanningError:
                 continue
             assert found.provenance['cost'] <= fixed.provenance['cost'] + sum_to_go + 1e-3
-    grown = branch.grafted(
-        stabilise(found, robot, final_cost=branch.S[onto]), robot, onto, since
-    )
+    grown = branch.grafted(stabilise(found, robot, final_cost=branch.S[onto]), robot, onto, since)
     assert grown.to_go[grown.first] > 0
     last = np.flatnonzero(grown.branch == 2)[-1]
     np.testing.assert_allclose(grown.x0[grown.next[last]], found.states[-1], atol=1e-6)

@@ -84,8 +84,9 @@ def test_two_frictions_of_a_kind_at_one_joint_add_up(monkeypatch, robot):
         planning_model(robot, friction=False).values
     )
     assert planning_model(twice).values[f'{new}.torque'] == 0.7
-    assert softened(twice).values[f'{new}.transition_rate'] == (
-        softened(robot).values['coulomb_friction.transition_rate']
+    assert (
+        softened(twice).values[f'{new}.transition_rate']
+        == (softened(robot).values['coulomb_friction.transition_rate'])
     )
     one, two = FrictionCompensation(robot), FrictionCompensation(twice)
     assert two.taken(0.0, 1.0) == pytest.approx(one.taken(0.0, 1.0) + 0.7)

@@ -45,12 +45,14 @@ def test_a_capture_coordinate_of_one_is_where_the_limit_holds_the_linear_model(p
 
 @pytest.mark.parametrize('stance', STANCES)
 def test_what_falls_backward_is_lost_and_what_falls_forward_may_step(screen, stance):
-    states = np.array([
-        lean(stance, 0.0),
-        lean(stance, -0.3),  # the foot cannot get behind the hip
-        lean(stance, 0.15, 0.3, swing=-0.3),  # nearly there
-        lean(stance, 0.5, 1.5, swing=1.0),  # far behind, falling fast
-    ])
+    states = np.array(
+        [
+            lean(stance, 0.0),
+            lean(stance, -0.3),  # the foot cannot get behind the hip
+            lean(stance, 0.15, 0.3, swing=-0.3),  # nearly there
+            lean(stance, 0.5, 1.5, swing=1.0),  # far behind, falling fast
+        ]
+    )
     said = screen.reach(stance, states)
     assert [said.allows(steps).tolist() for steps in range(3)] == [
         [True, False, False, False],

@@ -33,9 +33,7 @@ def rebalanced(done):
 @pytest.mark.parametrize('remedy', REMEDIES)
 def test_perturbed_robot_steps_and_stands(robot, step, remedy):
     x0 = np.array([0.015, -0.04, 0.03, 0.08])
-    done = executed(
-        step, robot, TrackingSettings(remedy=remedy), x0=x0, more=1.5, options=OPTIONS
-    )
+    done = executed(step, robot, TrackingSettings(remedy=remedy), x0=x0, more=1.5, options=OPTIONS)
     assert rebalanced(done)
 
 

@@ -131,5 +131,3 @@ def test_a_missing_file_and_another_archive_are_named(tmp_path):
     np.savez(tmp_path / 'other.npz', a=np.zeros(3))
     with pytest.raises(TreeError, match='is missing'):
         Tree.load(tmp_path / 'other.npz')
-
-

@@ -150,9 +150,7 @@ def test_arriving_is_being_in_the_tube_on_the_orbit(robot, shipped, compiled, mo
     assert (done.time[: len(inside)] == 0.0).all()
     assert (done.time[len(inside) :] > 0.0).all()
     # The step in begins in the goal region of the leg that stands, and does not end there.
-    np.testing.assert_array_equal(
-        nodes.orbit_of[done.node[-len(entry) :]], nodes.orbit_of[entry]
-    )
+    np.testing.assert_array_equal(nodes.orbit_of[done.node[-len(entry) :]], nodes.orbit_of[entry])
     assert (done.impacts[-len(entry) :] >= 1).all()
 
 

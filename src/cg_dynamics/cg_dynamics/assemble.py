@@ -70,9 +70,7 @@ def acting_effects(model: Model) -> tuple[Effect, ...]:
 
 def parameter_names(model: Model, setup: Setup) -> tuple[str, ...]:
     """Full names of the parameter vector of a model in a set-up."""
-    springs = (
-        f'spring{i}.{field}' for i in range(len(setup.springs)) for field in SPRING_FIELDS
-    )
+    springs = (f'spring{i}.{field}' for i in range(len(setup.springs)) for field in SPRING_FIELDS)
     return (*model.declarations, *springs)
 
 

@@ -10,9 +10,7 @@ the energies.
 import casadi as ca
 
 
-def manipulator(
-    kinetic: ca.SX, potential: ca.SX, q: ca.SX, v: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def manipulator(kinetic: ca.SX, potential: ca.SX, q: ca.SX, v: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Mass matrix M(q), shape (n, n), and bias b(q, v), shape (n, 1), of (LAG).
 
     Args:
@@ -23,9 +21,7 @@ def manipulator(
     """
     momentum = ca.gradient(kinetic, v)
     mass_matrix = ca.jacobian(momentum, v)
-    bias = (
-        ca.jtimes(momentum, q, v) - ca.gradient(kinetic, q) + ca.gradient(potential, q)
-    )
+    bias = ca.jtimes(momentum, q, v) - ca.gradient(kinetic, q) + ca.gradient(potential, q)
     return mass_matrix, bias
 
 

@@ -120,14 +120,20 @@ class Model:
                 for name, q in file.sensors.get(channel, {}).items():
                     _same_unit(f'sensors.{channel}.{name}', q.unit, unit)
                     right = 0 <= q.value < math.inf if name == 'noise' else 0 < q.value < math.inf
-                    _require(right, f'sensors.{channel}.{name}.value', q,
-                             'a finite number of 0 or more' if name == 'noise'
-                             else 'a positive finite number')
+                    _require(
+                        right,
+                        f'sensors.{channel}.{name}.value',
+                        q,
+                        'a finite number of 0 or more'
+                        if name == 'noise'
+                        else 'a positive finite number',
+                    )
             for channel, unit in zip(body.inputs, body.input_units, strict=True):
                 for name, q in file.actuators.get(channel, {}).items():
                     _same_unit(f'actuators.{channel}.{name}', q.unit, unit)
-                    _require(q.value > 0, f'actuators.{channel}.{name}.value', q,
-                             'a positive number')
+                    _require(
+                        q.value > 0, f'actuators.{channel}.{name}.value', q, 'a positive number'
+                    )
         except ModelError as error:
             raise ModelError(f'{where}: {error}') from None
         model = cls(
@@ -204,13 +210,16 @@ class Model:
         for effect in self.effects:
             if effect.label == label:
                 return effect
-        raise ModelError(f'model {self.name!r} has no effect {label!r}; it has: '
-                         f'{", ".join(e.label for e in self.effects) or "none"}')
+        raise ModelError(
+            f'model {self.name!r} has no effect {label!r}; it has: '
+            f'{", ".join(e.label for e in self.effects) or "none"}'
+        )
 
     def values_of(self, effect: Effect) -> dict[str, float]:
         """The values of one effect's own parameters, by their names within it."""
-        return {p.name: self.quantities[f'{effect.label}.{p.name}'].value
-                for p in effect.parameters}
+        return {
+            p.name: self.quantities[f'{effect.label}.{p.name}'].value for p in effect.parameters
+        }
 
     def with_effect(self, name: str, at: str | None = None, **values: float) -> 'Model':
         """This model and one more effect; parameters not given take their defaults."""
@@ -231,9 +240,7 @@ class Model:
             self,
             effects=tuple(e for e in self.effects if e is not gone),
             quantities={
-                name: q
-                for name, q in self.quantities.items()
-                if not name.startswith(f'{label}.')
+                name: q for name, q in self.quantities.items() if not name.startswith(f'{label}.')
             },
         )
 
@@ -293,7 +300,9 @@ def _entries_read_only(channels):
 
 
 def _match(
-    declared: tuple[Parameter, ...], given: Mapping[str, Quantity], place: str,
+    declared: tuple[Parameter, ...],
+    given: Mapping[str, Quantity],
+    place: str,
     needed: bool = False,
 ) -> dict[str, Quantity]:
     """Quantities as declared; a mechanism needs all of them, an effect has typical ones."""
@@ -325,8 +334,10 @@ def _same_unit(place: str, unit: str, expected: str) -> None:
 def _known(place: str, names, allowed) -> None:
     for name in names:
         if name not in allowed:
-            raise ModelError(f'{place}: unknown entry {shown(name)}; allowed: '
-                             f'{", ".join(allowed)}{meant(name, allowed)}')
+            raise ModelError(
+                f'{place}: unknown entry {shown(name)}; allowed: '
+                f'{", ".join(allowed)}{meant(name, allowed)}'
+            )
 
 
 __all__ = ['Model', 'ModelError', 'ModelFileError']

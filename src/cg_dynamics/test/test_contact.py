@@ -93,9 +93,7 @@ def test_landing_keeps_the_laws_of_mechanics(bare, law, stance, landing):
     assert off > 0
     assert abs(along) <= law.friction * off * (1 + 1e-12)
     # The foot came with the velocity of the hip and its own about it.
-    came = (
-        l * x[3 - leg] * turning(x[1 - leg]) - l * x[2 + leg] * turning(x[leg])
-    )
+    came = l * x[3 - leg] * turning(x[1 - leg]) - l * x[2 + leg] * turning(x[leg])
     np.testing.assert_allclose(
         done.landing_velocity @ ground.normal, -law.restitution * (came @ ground.normal),
         atol=1e-12,

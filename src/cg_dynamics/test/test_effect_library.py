@@ -67,9 +67,7 @@ def motion_of(setup):
 
 def inputs_of(model, setup, torque=TORQUE, time=TIME):
     extra = compile_model(model, setup).input_names[1:]
-    columns = [
-        time + HALF if name == 'time' else np.ones(len(time)) for name in extra
-    ]
+    columns = [time + HALF if name == 'time' else np.ones(len(time)) for name in extra]
     return np.column_stack([torque, *columns])
 
 
@@ -112,9 +110,7 @@ def test_every_start_and_both_ends_of_the_first_range_can_be_simulated(bare, nam
     grids = [[(p.name, s) for s in (p.starts if p.free else p.starts[:1])] for p in others]
     values = (*first.starts, first.lower, first.upper)
     points = [{first.name: v} for v in values]
-    points += [
-        {first.name: first.starts[0], **dict(point)} for point in itertools.product(*grids)
-    ]
+    points += [{first.name: first.starts[0], **dict(point)} for point in itertools.product(*grids)]
     for point in points:
         model = bare.with_effect(name, at=site, **point)
         states, outputs = run(model, Setup(springs=(SPRING,)))

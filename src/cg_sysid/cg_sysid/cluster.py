@@ -37,6 +37,4 @@ class Cluster(cluster.Cluster):
 def software_here() -> dict[str, str]:
     """What decides an answer: versions of Python and packages, and our own source, hashed."""
     source = cluster.source_hash(cg_description, cg_dynamics, cg_sysid)
-    return {
-        **software(), **cluster.tools_here(), 'source of cg_sysid and what it imports': source
-    }
+    return {**software(), **cluster.tools_here(), 'source of cg_sysid and what it imports': source}

@@ -30,9 +30,7 @@ class Deadline:
         clock: A clock in s that never jumps.
     """
 
-    def __init__(
-        self, seconds: float = float('inf'), clock: Callable[[], float] = time.monotonic
-    ):
+    def __init__(self, seconds: float = float('inf'), clock: Callable[[], float] = time.monotonic):
         self.seconds = seconds
         self._clock, self._began, self._asked = clock, clock(), threading.Event()
 

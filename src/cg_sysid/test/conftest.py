@@ -7,7 +7,7 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.loading import load_bags
 from cg_sysid.cli.diagnose import diagnosis_curves
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
@@ -48,20 +48,20 @@ def bags(model_file, tmp_path_factory):
 
 
 @pytest.fixture(scope='session')
-def intake(bags, model_file):
-    return take_in(bags, model_file)
+def loaded(bags, model_file):
+    return load_bags(bags, model_file)
 
 
 @pytest.fixture(scope='session')
-def diagnosed(intake, model_file):
+def diagnosed(loaded, model_file):
     options = Options(effects=EFFECTS, rounds=1, workers=1)
-    return diagnose(Model.load(model_file), intake.records, options)
+    return diagnose(Model.load(model_file), loaded.records, options)
 
 
 @pytest.fixture(scope='session')
-def facts(diagnosed, intake, model_file):
+def facts(diagnosed, loaded, model_file):
     made = provenance(model_file, ['diagnose', 'bags'], {'rounds': 1}, '2011-03-13T07:00:00Z')
-    return diagnosis_facts(diagnosed, intake, made)
+    return diagnosis_facts(diagnosed, loaded, made)
 
 
 @pytest.fixture(scope='session')

@@ -78,8 +78,8 @@ def test_imagined_record_is_what_the_machine_would_record(model_file):
     nominal = Model.load(model_file)
     experiment = load_experiment('swing_inner_fixed')
     record = _record(nominal, 'swing_inner_fixed', 20111, 5.0)
-    (trial,) = prepare(nominal, [record])
-    seen = imagined(nominal, trial.sigma, experiment, experiment.excitation)
-    difference = (seen.outputs - trial.outputs)[100:] / trial.sigma
+    (data_set,) = prepare(nominal, [record])
+    seen = imagined(nominal, data_set.sigma, experiment, experiment.excitation)
+    difference = (seen.outputs - data_set.outputs)[100:] / data_set.sigma
     # Two draws of noise: the difference has a standard deviation of sqrt(2).
     assert difference.std() == pytest.approx(2**0.5, rel=0.1)

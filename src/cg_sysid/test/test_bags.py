@@ -87,19 +87,26 @@ def test_the_command_is_the_input_only_on_request_or_for_want_of_another(tmp_pat
     np.testing.assert_array_equal(commanded.inputs['hip_torque'], command['hip_torque'])
     raw = bags.read_raw(path)
     del raw.topics['/applied_torque']
-    np.testing.assert_array_equal(
-        bags.to_record(raw).inputs['hip_torque'], command['hip_torque']
-    )
+    np.testing.assert_array_equal(bags.to_record(raw).inputs['hip_torque'], command['hip_torque'])
 
 
-def write_foreign(path, *, note=NOTE, torque=(), angle=(), msgtype='sensor_msgs/msg/JointState',
-                  storage=StoragePlugin.MCAP, compression=None):
+def write_foreign(
+    path,
+    *,
+    note=NOTE,
+    torque=(),
+    angle=(),
+    msgtype='sensor_msgs/msg/JointState',
+    storage=StoragePlugin.MCAP,
+    compression=None,
+):
     """A pendulum bag as another tool would write it; torque and angle are (stamp, value) pairs."""
     types = STORE.types
 
     def joint_state(stamp, field, value):
-        time = types['builtin_interfaces/msg/Time'](sec=stamp // NS_PER_S,
-                                                    nanosec=stamp % NS_PER_S)
+        time = types['builtin_interfaces/msg/Time'](
+            sec=stamp // NS_PER_S, nanosec=stamp % NS_PER_S
+        )
         empty = np.array([], dtype=float)
         fields = {'position': empty, 'velocity': empty, 'effort': empty}
         fields[field] = np.array([value])
@@ -112,13 +119,17 @@ def write_foreign(path, *, note=NOTE, torque=(), angle=(), msgtype='sensor_msgs/
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         if note is not None:
-            connection = writer.add_connection('/experiment', 'std_msgs/msg/String',
-                                               typestore=STORE)
-            text = types['std_msgs/msg/String'](data=note if isinstance(note, str)
-                                                else yaml.safe_dump(note))
+            connection = writer.add_connection(
+                '/experiment', 'std_msgs/msg/String', typestore=STORE
+            )
+            text = types['std_msgs/msg/String'](
+                data=note if isinstance(note, str) else yaml.safe_dump(note)
+            )
             writer.write(connection, START, STORE.serialize_cdr(text, 'std_msgs/msg/String'))
-        for topic, field, samples in (('/applied_torque', 'effort', torque),
-                                      ('/joint_states', 'position', angle)):
+        for topic, field, samples in (
+            ('/applied_torque', 'effort', torque),
+            ('/joint_states', 'position', angle),
+        ):
             if samples is None:
                 continue
             connection = writer.add_connection(topic, msgtype, typestore=STORE)
@@ -127,8 +138,9 @@ def write_foreign(path, *, note=NOTE, torque=(), angle=(), msgtype='sensor_msgs/
                     message = types[msgtype](data='')
                 else:
                     message = joint_state(stamp, field, value)
-                writer.write(connection, START + 2_000_000 * k + 1,
-                             STORE.serialize_cdr(message, msgtype))
+                writer.write(
+                    connection, START + 2_000_000 * k + 1, STORE.serialize_cdr(message, msgtype)
+                )
     return path
 
 
@@ -147,8 +159,13 @@ def regular(count=50, value=0.1):
     ],
 )
 def test_every_storage_reads_the_same(tmp_path, storage, compression):
-    path = write_foreign(tmp_path / 'bag', torque=regular(), angle=regular(), storage=storage,
-                         compression=compression)
+    path = write_foreign(
+        tmp_path / 'bag',
+        torque=regular(),
+        angle=regular(),
+        storage=storage,
+        compression=compression,
+    )
     record = bags.read_bag(path)
     np.testing.assert_array_equal(record.outputs['angle'], 0.1 * np.arange(50))
 
@@ -267,8 +284,9 @@ def test_a_bag_without_metadata_names_the_way_out(tmp_path):
 
 
 def test_a_sqlite_bag_without_metadata_names_its_own_way_out(tmp_path):
-    path = write_foreign(tmp_path / 'bag', torque=regular(), angle=regular(),
-                         storage=StoragePlugin.SQLITE3)
+    path = write_foreign(
+        tmp_path / 'bag', torque=regular(), angle=regular(), storage=StoragePlugin.SQLITE3
+    )
     (path / 'metadata.yaml').unlink()
     with pytest.raises(RecordingError, match='ros2 bag reindex'):
         bags.read_bag(path)

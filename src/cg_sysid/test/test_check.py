@@ -63,7 +63,10 @@ def with_samples(raw, topic, index):
     """The recording with only the given samples of one topic, in the given order."""
     old = raw.topics[topic]
     return edit(
-        raw, topic, stamp_ns=old.stamp_ns[index], log_ns=old.log_ns[index],
+        raw,
+        topic,
+        stamp_ns=old.stamp_ns[index],
+        log_ns=old.log_ns[index],
         values={c: v[index] for c, v in old.values.items()},
         absent={c: v[index] for c, v in old.absent.items()},
     )
@@ -94,6 +97,7 @@ def frozen(first, last):
     def change(values):
         values[first:last] = values[first]
         return values
+
     return change
 
 
@@ -101,6 +105,7 @@ def assigned(index, value):
     def change(values):
         values[index] += value
         return values
+
     return change
 
 
@@ -115,59 +120,175 @@ FAULTS = {
     'hip stuck': (hip(frozen(2000, 2250)), 'stuck', 'hip_angle', 'unusable', 4.0),
     'imu stuck': (imu_angle(frozen(2000, 2250)), 'stuck', 'imu_angle', 'unusable', 4.0),
     'gyro stuck': (imu_rate(frozen(2000, 2250)), 'stuck', 'imu_rate', 'unusable', 4.0),
-    'hip shift': (hip(lambda v: v + 0.02 * (INDEX > 2500)), 'zero_shift', 'hip_angle',
-                  'unusable', 5.0),
-    'imu shift': (imu_angle(lambda v: v + 0.02 * (INDEX > 2500)), 'zero_shift', 'imu_angle',
-                  'unusable', 5.0),
-    'hip clipped': (hip(lambda v: np.clip(v, -0.15, 0.15)), 'sensor_clipping', 'hip_angle',
-                    'unusable', None),
+    'hip shift': (
+        hip(lambda v: v + 0.02 * (INDEX > 2500)),
+        'zero_shift',
+        'hip_angle',
+        'unusable',
+        5.0,
+    ),
+    'imu shift': (
+        imu_angle(lambda v: v + 0.02 * (INDEX > 2500)),
+        'zero_shift',
+        'imu_angle',
+        'unusable',
+        5.0,
+    ),
+    'hip clipped': (
+        hip(lambda v: np.clip(v, -0.15, 0.15)),
+        'sensor_clipping',
+        'hip_angle',
+        'unusable',
+        None,
+    ),
     'gyro sign': (imu_rate(lambda v: -v), 'sign_error', 'imu_rate', 'unusable', None),
     'gyro in degrees': (imu_rate(lambda v: 57.3 * v), 'unit', 'imu_rate', 'unusable', None),
     'gyro scale': (imu_rate(lambda v: 1.5 * v), 'scale', 'imu_rate', 'warnings', None),
     'spikes': (hip(assigned(SPIKED, 0.05)), 'spikes', 'hip_angle', 'warnings', None),
     'imu spike': (imu_angle(assigned(1234, 1.0)), 'spikes', 'imu_angle', 'warnings', 2.468),
-    'samples lost': (lambda r: with_samples(r, '/hip_encoder', np.delete(INDEX, SPIKED)),
-                     'dropped_samples', '/hip_encoder', 'warnings', None),
-    'sensor hole': (lambda r: with_samples(r, '/hip_encoder', HOLE), 'dropped_samples',
-                    '/hip_encoder', 'warnings', 4.0),
-    'torque hole': (lambda r: with_samples(r, '/applied_torque', HOLE), 'dropped_samples',
-                    '/applied_torque', 'unusable', 4.0),
-    'duplicates': (lambda r: with_samples(r, '/imu', np.sort(np.r_[INDEX, 500:510])),
-                   'duplicates', '/imu', 'warnings', 1.0),
-    'clock back': (lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, -50_000_000, 0)),
-                   'clock_jump', '/imu', 'warnings', 4.0),
-    'clock ahead': (lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, 80_000_000, 0)),
-                    'clock_jump', '/imu', 'warnings', 4.0),
-    'overtaking': (lambda r: with_samples(r, '/imu', SWAPPED), 'time_backwards', '/imu',
-                   'warnings', 2.0),
-    'rate changed': (lambda r: with_samples(r, '/hip_encoder', np.r_[0:2000, 2000:SAMPLES:2]),
-                     'sampling_rate_change', '/hip_encoder', 'warnings', 4.0),
-    'rate halved': (lambda r: with_samples(r, '/hip_encoder', INDEX[::2]), 'rate',
-                    '/hip_encoder', 'warnings', None),
-    'late start': (lambda r: with_samples(r, '/imu', INDEX[1000:]), 'starts_late', '/imu',
-                   'warnings', 0.0),
-    'no overlap': (lambda r: with_stamps(r, '/imu', 10**11), 'no_overlap', '/imu', 'unusable',
-                   None),
+    'samples lost': (
+        lambda r: with_samples(r, '/hip_encoder', np.delete(INDEX, SPIKED)),
+        'dropped_samples',
+        '/hip_encoder',
+        'warnings',
+        None,
+    ),
+    'sensor hole': (
+        lambda r: with_samples(r, '/hip_encoder', HOLE),
+        'dropped_samples',
+        '/hip_encoder',
+        'warnings',
+        4.0,
+    ),
+    'torque hole': (
+        lambda r: with_samples(r, '/applied_torque', HOLE),
+        'dropped_samples',
+        '/applied_torque',
+        'unusable',
+        4.0,
+    ),
+    'duplicates': (
+        lambda r: with_samples(r, '/imu', np.sort(np.r_[INDEX, 500:510])),
+        'duplicates',
+        '/imu',
+        'warnings',
+        1.0,
+    ),
+    'clock back': (
+        lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, -50_000_000, 0)),
+        'clock_jump',
+        '/imu',
+        'warnings',
+        4.0,
+    ),
+    'clock ahead': (
+        lambda r: with_stamps(r, '/imu', np.where(INDEX > 2000, 80_000_000, 0)),
+        'clock_jump',
+        '/imu',
+        'warnings',
+        4.0,
+    ),
+    'overtaking': (
+        lambda r: with_samples(r, '/imu', SWAPPED),
+        'time_backwards',
+        '/imu',
+        'warnings',
+        2.0,
+    ),
+    'rate changed': (
+        lambda r: with_samples(r, '/hip_encoder', np.r_[0:2000, 2000:SAMPLES:2]),
+        'sampling_rate_change',
+        '/hip_encoder',
+        'warnings',
+        4.0,
+    ),
+    'rate halved': (
+        lambda r: with_samples(r, '/hip_encoder', INDEX[::2]),
+        'rate',
+        '/hip_encoder',
+        'warnings',
+        None,
+    ),
+    'late start': (
+        lambda r: with_samples(r, '/imu', INDEX[1000:]),
+        'starts_late',
+        '/imu',
+        'warnings',
+        0.0,
+    ),
+    'no overlap': (
+        lambda r: with_stamps(r, '/imu', 10**11),
+        'no_overlap',
+        '/imu',
+        'unusable',
+        None,
+    ),
     'saturated torque': (
         lambda r: with_values(r, '/applied_torque', 'hip_torque', lambda v: np.clip(v, -4, 4)),
-        'saturation', 'hip_torque', 'warnings', None),
-    'no torque': (lambda r: without(r, '/applied_torque'), 'topic_missing', '/applied_torque',
-                  'unusable', None),
-    'no encoder': (lambda r: without(r, '/hip_encoder'), 'topic_missing', '/hip_encoder',
-                   'warnings', None),
-    'one sample': (lambda r: with_samples(r, '/imu', INDEX[:1]), 'too_few_samples', '/imu',
-                   'unusable', None),
-    'stale zeros': (lambda r: replace(r, note={**r.note, 'zeroed_at': '2010-03-13T07:00:00Z'}),
-                    'zeroing_stale', '', 'warnings', None),
-    'zeros unknown': (lambda r: replace(r, note={**r.note, 'zeroed_at': 'this morning'}),
-                      'zeroing_unknown', '', 'warnings', None),
-    'no set-up': (lambda r: replace(r, note={'mechanism': r.mechanism}), 'metadata_missing', '',
-                  'warnings', None),
-    'wrong set-up': (lambda r: replace(r, note={**r.note, 'setup': {'stance': 'left'}}),
-                     'setup_wrong', '', 'unusable', None),
-    'not at rest': (lambda r: replace(
-        with_values(r, '/hip_encoder', 'hip_angle', lambda v: v + INDEX * 8e-3),
-        note={**r.note, 'initial_state': 'rest'}), 'not_at_rest', 'hip_angle', 'warnings', 0.0),
+        'saturation',
+        'hip_torque',
+        'warnings',
+        None,
+    ),
+    'no torque': (
+        lambda r: without(r, '/applied_torque'),
+        'topic_missing',
+        '/applied_torque',
+        'unusable',
+        None,
+    ),
+    'no encoder': (
+        lambda r: without(r, '/hip_encoder'),
+        'topic_missing',
+        '/hip_encoder',
+        'warnings',
+        None,
+    ),
+    'one sample': (
+        lambda r: with_samples(r, '/imu', INDEX[:1]),
+        'too_few_samples',
+        '/imu',
+        'unusable',
+        None,
+    ),
+    'stale zeros': (
+        lambda r: replace(r, note={**r.note, 'zeroed_at': '2010-03-13T07:00:00Z'}),
+        'zeroing_stale',
+        '',
+        'warnings',
+        None,
+    ),
+    'zeros unknown': (
+        lambda r: replace(r, note={**r.note, 'zeroed_at': 'this morning'}),
+        'zeroing_unknown',
+        '',
+        'warnings',
+        None,
+    ),
+    'no set-up': (
+        lambda r: replace(r, note={'mechanism': r.mechanism}),
+        'metadata_missing',
+        '',
+        'warnings',
+        None,
+    ),
+    'wrong set-up': (
+        lambda r: replace(r, note={**r.note, 'setup': {'stance': 'left'}}),
+        'setup_wrong',
+        '',
+        'unusable',
+        None,
+    ),
+    'not at rest': (
+        lambda r: replace(
+            with_values(r, '/hip_encoder', 'hip_angle', lambda v: v + INDEX * 8e-3),
+            note={**r.note, 'initial_state': 'rest'},
+        ),
+        'not_at_rest',
+        'hip_angle',
+        'warnings',
+        0.0,
+    ),
 }
 
 
@@ -220,16 +341,19 @@ def test_equal_samples_where_a_free_swing_turns_are_no_end_of_the_sensor(roundin
     assert not check_recording(raw).of('sensor_clipping')
     # The sensor really ends, and the same rounding hides it no more.
     for share in (0.97, 0.8):
-        short = joints(synthesise(Synthesis(quantum=0.0, **FREE), seed),
-                       lambda values, share=share: rounding(ended(values, share)))
+        short = joints(
+            synthesise(Synthesis(quantum=0.0, **FREE), seed),
+            lambda values, share=share: rounding(ended(values, share)),
+        )
         assert check_recording(short).of('sensor_clipping')
 
 
 @pytest.mark.parametrize(('size', 'verdict'), [(1.5e-3, 'warnings'), (0.05, 'unusable')])
 def test_a_zero_shift_is_broken_only_where_it_is_larger_than_zeros_are_known(size, verdict):
     raw = synthesise(Synthesis(quantum=0.0, noise=2e-5, **FREE), 1)
-    shifted = with_values(raw, '/joint_states', 'elbow_angle',
-                         lambda values: values + size * (INDEX > 2500))
+    shifted = with_values(
+        raw, '/joint_states', 'elbow_angle', lambda values: values + size * (INDEX > 2500)
+    )
     report = check_recording(shifted)
     assert [f.where for f in report.of('zero_shift')] == ['elbow_angle']
     assert report.verdict == verdict
@@ -251,8 +375,11 @@ def test_a_refusal_can_be_overruled_and_stays_in_the_report():
 
 def test_the_command_line_overrules_and_lists_what_can_be(tmp_path, capsys):
     values = synthesise(Synthesis(duration=2.0), 0)
-    record = bags.to_record(with_values(
-        values, '/hip_encoder', 'hip_angle', lambda v: v + 0.05 * (np.arange(len(v)) > 500)))
+    record = bags.to_record(
+        with_values(
+            values, '/hip_encoder', 'hip_angle', lambda v: v + 0.05 * (np.arange(len(v)) > 500)
+        )
+    )
     path = str(bags.write_bag(tmp_path / 'shifted', record))
     assert check.main([path]) == 1
     capsys.readouterr()
@@ -271,8 +398,13 @@ def test_every_code_is_documented():
     rows = [line.split('|')[1] for line in table.splitlines() if line.startswith('| `')]
     listed = {code for row in rows for code in re.findall(r'`(\w+)`', row)}
     sources = Path(check.__file__).parent
-    modules = ['check', 'clock', 'check_jitter', 'intake', *(
-        p.stem for p in sources.glob('check_*.py'))]
+    modules = [
+        'check',
+        'clock',
+        'check_jitter',
+        'intake',
+        *(p.stem for p in sources.glob('check_*.py')),
+    ]
     written = set()
     for module in modules:
         source = (sources / f'{module}.py').read_text(encoding='utf-8')
@@ -293,8 +425,9 @@ def test_feedback_is_seen_in_most_cases():
     def with_feedback(raw):
         angle = raw.topics['/hip_encoder'].values['hip_angle']
         lean = raw.topics['/imu'].values['imu_angle']
-        return with_values(raw, '/applied_torque', 'hip_torque',
-                           lambda v: -50.0 * angle - 5.0 * lean + 0.1 * v)
+        return with_values(
+            raw, '/applied_torque', 'hip_torque', lambda v: -50.0 * angle - 5.0 * lean + 0.1 * v
+        )
 
     reports = [check_recording(with_feedback(synthesise(Synthesis(), s))) for s in range(10)]
     assert sum(bool(report.of('closed_loop')) for report in reports) >= 8
@@ -302,9 +435,14 @@ def test_feedback_is_seen_in_most_cases():
 
 def test_the_region_of_use_is_compared_with_the_data():
     raw = synthesise(Synthesis(amplitude=0.1), 0)
-    report = check_recording(raw, use_region={
-        'hip_angle': (-0.1, 0.1), 'hip_angle_rate': (-40.0, 40.0), 'knee': (0.0, 1.0),
-    })
+    report = check_recording(
+        raw,
+        use_region={
+            'hip_angle': (-0.1, 0.1),
+            'hip_angle_rate': (-40.0, 40.0),
+            'knee': (0.0, 1.0),
+        },
+    )
     assert [f.where for f in report.of('coverage_poor')] == ['hip_angle_rate']
     assert [f.where for f in report.of('coverage_unknown')] == ['knee']
 

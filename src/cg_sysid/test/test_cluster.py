@@ -57,10 +57,10 @@ def processes(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def local(intake, model_file):
+def local(loaded, model_file):
     """What local processes answer."""
     options = Options(effects=EFFECTS, rounds=1, workers=1)
-    return diagnose(Model.load(model_file), intake.records, options)
+    return diagnose(Model.load(model_file), loaded.records, options)
 
 
 def assert_same(found, local):
@@ -75,11 +75,11 @@ def assert_same(found, local):
         assert a.train.sigmas.tolist() == b.train.sigmas.tolist()
 
 
-def test_the_answer_is_that_of_local_processes(processes, local, intake, model_file):
+def test_the_answer_is_that_of_local_processes(processes, local, loaded, model_file):
     options = Options(effects=EFFECTS, rounds=1)
     with Cluster(processes.address) as workers, processes.client() as client:
-        found = diagnose(Model.load(model_file), intake.records, options, executor=workers)
-        # Two sets of trials, sent once each, however many fits there were.
+        found = diagnose(Model.load(model_file), loaded.records, options, executor=workers)
+        # Two sets of data sets, sent once each, however many fits there were.
         sent = [key for key in tasks(client) if key.startswith('compass_gait')]
     assert len(sent) == 2
     assert_same(found, local)
@@ -119,16 +119,14 @@ def kill_who_is_stuck(marker):
 
 
 def test_a_worker_killed_in_mid_run_changes_nothing(
-    processes, local, intake, model_file, tmp_path
+    processes, local, loaded, model_file, tmp_path
 ):
     model, options = Model.load(model_file), Options(effects=EFFECTS, rounds=1)
     marker, steps = tmp_path / 'pid', []
     processes.add_worker()
     with Stalling(processes.address, marker) as workers, ThreadPoolExecutor(1) as other:
         killed = other.submit(kill_who_is_stuck, marker)
-        found = diagnose(
-            model, intake.records, options, lambda *step: steps.append(step), workers
-        )
+        found = diagnose(model, loaded.records, options, lambda *step: steps.append(step), workers)
         assert killed.result() in [process.pid for process in processes.running[1:]]
     assert_same(found, local)
     for what in dict.fromkeys(step[0] for step in steps):

@@ -37,7 +37,7 @@ def test_names_of_executables_do_as_well(capsys):
 def test_an_unknown_command_names_the_nearest(typed, meant, capsys):
     assert main([typed]) == 2
     assert capsys.readouterr().err == (
-        f"cg: error: there is no command {typed!r}; did you mean "
+        f'cg: error: there is no command {typed!r}; did you mean '
         f"'{meant or 'frequency-response'}'?\n"
     )
 

@@ -21,9 +21,9 @@ def test_a_curve_is_what_the_model_predicts(model_file, effect):
         'record', extended, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
         [lambda t: 9.0 * np.sin(4.0 * t)], 2.0, 0.004, 1,
     )  # fmt: skip
-    (trial,) = prepare(nominal, [record])
-    before, after = (score(model, [trial]) for model in (nominal, extended))
-    curve = make_curve(trial, 'all', nominal, before.motions[0], extended, after.motions[0])
-    np.testing.assert_array_equal(curve.before, predict(nominal, trial, before.motions[0]))
-    np.testing.assert_array_equal(curve.after, predict(extended, trial, after.motions[0]))
-    assert curve.position.shape == (len(trial.time), 3)
+    (data_set,) = prepare(nominal, [record])
+    before, after = (score(model, [data_set]) for model in (nominal, extended))
+    curve = make_curve(data_set, 'all', nominal, before.motions[0], extended, after.motions[0])
+    np.testing.assert_array_equal(curve.before, predict(nominal, data_set, before.motions[0]))
+    np.testing.assert_array_equal(curve.after, predict(extended, data_set, after.motions[0]))
+    assert curve.position.shape == (len(data_set.time), 3)

@@ -110,9 +110,9 @@ def test_work_under_way_is_dropped_and_what_was_done_is_known(workers):
 
 def test_a_fit_ends_between_its_iterations(delayed):
     model, records = delayed
-    trials = prepare(model, records)
+    data_sets = prepare(model, records)
     with Deadline(0.0).kept(), pytest.raises(OutOfTime):
-        fit(model, trials)
+        fit(model, data_sets)
 
 
 def test_first_looks_are_an_answer(delayed):
@@ -194,15 +194,15 @@ def test_a_search_goes_on_from_what_is_kept(delayed, tmp_path, monkeypatch):
 
 def test_what_decides_a_fit_names_its_file(delayed, tmp_path):
     model, records = delayed
-    trials = prepare(model, records)
+    data_sets = prepare(model, records)
     louder = prepare(model, [records[1], records[0]])
-    assert kept_fits.place_of(model, trials) is None
+    assert kept_fits.place_of(model, data_sets) is None
     with kept_fits.kept_in(tmp_path):
         places = [
-            kept_fits.place_of(model, trials, reach=1.0),
-            kept_fits.place_of(model, trials, reach=2.0),
+            kept_fits.place_of(model, data_sets, reach=1.0),
+            kept_fits.place_of(model, data_sets, reach=2.0),
             kept_fits.place_of(model, louder, reach=1.0),
-            kept_fits.place_of(model.with_effect('torque_bias'), trials, reach=1.0),
+            kept_fits.place_of(model.with_effect('torque_bias'), data_sets, reach=1.0),
         ]
         assert kept_fits.place_of(model, prepare(model, records), reach=1.0) == places[0]
     assert len(set(places)) == len(places)
@@ -259,12 +259,12 @@ def test_an_interrupt_ends_with_the_best_so_far(bags, model_file, tmp_path):
 
 def test_a_fit_is_kept_once_and_recalled_as_it_was(delayed, tmp_path):
     model, records = delayed
-    trials = prepare(model, records)
+    data_sets = prepare(model, records)
     with kept_fits.kept_in(tmp_path):
         with pytest.raises(IdentificationError):
             fit(model, [])
         assert not list(tmp_path.iterdir())
-        once, again = fit(model, trials), fit(model, trials)
+        once, again = fit(model, data_sets), fit(model, data_sets)
     assert len(list(tmp_path.iterdir())) == 1
     assert again.evaluations < once.evaluations
     for name in ('values', 'covariance', 'mse', 'count', 'cost', 'inflation', 'converged'):

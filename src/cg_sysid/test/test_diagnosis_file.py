@@ -97,8 +97,8 @@ def test_the_interval_of_a_logarithmic_parameter_stays_positive():
     assert interval(1.0, math.inf) is None
 
 
-def test_unusable_facts_have_the_same_fields(facts, intake, model_file):
-    made = unusable_facts(Model.load(model_file), intake, 'broken', facts['provenance'])
+def test_unusable_facts_have_the_same_fields(facts, loaded, model_file):
+    made = unusable_facts(Model.load(model_file), loaded, 'broken', facts['provenance'])
     assert set(made) == set(facts)
     json.dumps(made, allow_nan=False)
 

@@ -49,10 +49,10 @@ def machine(nominal):
 def test_pieces_of_a_recording_share_its_zero(nominal, machine):
     whole = [_recording(machine, k, zero) for k, zero in enumerate(ZEROS[:2])]
     pieces = [piece for record in whole for piece in record.segments(1.0)]
-    trials = prepare(nominal, pieces)
-    assert len(trials) == 8
-    found = fit(nominal.with_effect('encoder_zero', zero=0.0), trials)
-    zeros = [values['encoder_zero.zero'] for values in found.own_by_name(trials).values()]
+    data_sets = prepare(nominal, pieces)
+    assert len(data_sets) == 8
+    found = fit(nominal.with_effect('encoder_zero', zero=0.0), data_sets)
+    zeros = [values['encoder_zero.zero'] for values in found.own_by_name(data_sets).values()]
     sigmas = [s[0] for s in found.own_sigmas]
     for k, zero in enumerate(ZEROS[:2]):
         own = zeros[4 * k : 4 * k + 4]
@@ -60,7 +60,7 @@ def test_pieces_of_a_recording_share_its_zero(nominal, machine):
         assert abs(own[0] - zero) < 4 * sigmas[4 * k]
     # A zero of its own for each piece would be about twice as uncertain as one for all four.
     alone = fit(nominal.with_effect('encoder_zero', zero=0.0), [
-        replace(trial, recording=trial.name) for trial in trials
+        replace(data_set, recording=data_set.name) for data_set in data_sets
     ])  # fmt: skip
     assert np.median([s[0] for s in alone.own_sigmas]) > 1.4 * np.median(sigmas)
 
@@ -69,11 +69,11 @@ def test_eliminated_together_is_eliminated_at_once(nominal, machine):
     """The step of a block is that of the whole system of equations, solved directly."""
     pieces = _recording(machine, 0, 0.01).segments(1.0)[:3]
     model = nominal.with_effect('encoder_zero', zero=0.0).with_effect('external_push')
-    trials = prepare(nominal, pieces)
+    data_sets = prepare(nominal, pieces)
     unknowns = unknowns_of(model)
     own = np.array([0.01, 0.5, 0.4])
-    guesses = [np.concatenate([trial.motion, own]) for trial in trials]
-    problem = Problem(model, trials, unknowns, guesses)
+    guesses = [np.concatenate([data_set.motion, own]) for data_set in data_sets]
+    problem = Problem(model, data_sets, unknowns, guesses)
     theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
     point = evaluate(problem, theta, guesses, np.inf, 1.0)
     assert len(problem.blocks) == 1
@@ -87,17 +87,17 @@ def test_eliminated_together_is_eliminated_at_once(nominal, machine):
     )
     # Condition of the whole: 1e9 or so.
     np.testing.assert_allclose(direct[len(own_g) :], step, rtol=1e-5, atol=1e-9)
-    zero = len(trials[0].motion)
-    assert len({trial[zero] for trial in found}) == 1
-    assert len({trial[zero + 1] for trial in found}) == 3
+    zero = len(data_sets[0].motion)
+    assert len({data_set[zero] for data_set in found}) == 1
+    assert len({data_set[zero + 1] for data_set in found}) == 3
     assert found[0][zero] - 0.01 == pytest.approx(direct[0], rel=1e-5)
 
 
 def test_it_costs_one_parameter_for_each_recording(nominal, machine):
     pieces = [p for k in range(2) for p in _recording(machine, k, ZEROS[k]).segments(2.0)]
-    trials = prepare(nominal, pieces)
-    base = try_candidate(Task(nominal), trials[:2], trials[2:])
-    zeroed = try_candidate(Task(nominal, ('encoder_zero', None)), trials[:2], trials[2:])
+    data_sets = prepare(nominal, pieces)
+    base = try_candidate(Task(nominal), data_sets[:2], data_sets[2:])
+    zeroed = try_candidate(Task(nominal, ('encoder_zero', None)), data_sets[:2], data_sets[2:])
     assert zeroed.unknowns == base.unknowns + 2
     assert len(events_of(zeroed, 'encoder_zero')) == 4
 

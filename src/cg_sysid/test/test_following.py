@@ -9,7 +9,7 @@ import pytest
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.loading import load_bags
 from cg_sysid.diagnosis.diagnose import judging_whole
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
@@ -104,14 +104,14 @@ def test_bags_are_cut_where_they_cannot_be_followed(pendulum, tmp_path):
     bags = [write_bag(tmp_path / name, replace(r, name=name)) for name, r in made.items()]
     model_file = tmp_path / 'pendulum.yaml'
     pendulum.save(model_file)
-    intake = take_in(bags, model_file)
-    whole, lost = intake.windows.records
+    loaded = load_bags(bags, model_file)
+    whole, lost = loaded.windows.records
     assert (whole.name, whole.whole, lost.whole) == ('swings', True, False)
-    assert intake.wholes == ()
-    assert intake.records[0].name == 'swings'
-    parts = [r for r in intake.records if intake.origin[r.name] == 'stands']
+    assert loaded.wholes == ()
+    assert loaded.records[0].name == 'swings'
+    parts = [r for r in loaded.records if loaded.origin[r.name] == 'stands']
     assert len(parts) == len(lost.cuts) + 1 > 2
-    chosen = take_in(bags, model_file, window=1.0)
+    chosen = load_bags(bags, model_file, window=1.0)
     assert chosen.windows.chosen == 1.0
     # Of what cannot be followed no whole can judge, whoever chose the windows.
     assert [r.name for r in chosen.wholes] == ['swings']

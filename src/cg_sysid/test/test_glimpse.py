@@ -10,8 +10,8 @@ from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.search import screening as glimpse
-from cg_sysid.search.candidates import Task, first_seconds, look_at, try_candidate
+from cg_sysid.search import excerpt as excerpt
+from cg_sysid.search.candidates import Task, first_seconds, screen, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFTER = tuple(Spring('inner', 1.0, (x, 1.0), 150.0, 0.5) for x in (1.3, -1.3))
@@ -38,39 +38,41 @@ def _windows(nominal, records, length=1.0):
 
 
 def test_of_long_records_all_begin(nominal):
-    trials = prepare(nominal, _records(nominal, 8.0))
-    assert glimpse.few(trials) == [0, 1]
-    assert glimpse.lengths(trials) == [2.0]
-    assert glimpse.lengths(prepare(nominal, _records(nominal, 3.0))) == []
+    data_sets = prepare(nominal, _records(nominal, 8.0))
+    assert excerpt.few(data_sets) == [0, 1]
+    assert excerpt.lengths(data_sets) == [2.0]
+    assert excerpt.lengths(prepare(nominal, _records(nominal, 3.0))) == []
 
 
 def test_of_many_short_records_some_of_every_set_up(nominal):
-    trials = _windows(nominal, _records(nominal, 20.0, (SPRINGS, SPRINGS, SOFTER)))
-    few = glimpse.few(trials)
-    assert glimpse.FEWEST <= len(few) <= len(trials) / 2
-    assert {repr(trials[i].setup) for i in few} == {repr(trial.setup) for trial in trials}
-    assert {trials[i].recording for i in few} == {trial.recording for trial in trials}
+    data_sets = _windows(nominal, _records(nominal, 20.0, (SPRINGS, SPRINGS, SOFTER)))
+    few = excerpt.few(data_sets)
+    assert excerpt.FEWEST <= len(few) <= len(data_sets) / 2
+    assert {repr(data_sets[i].setup) for i in few} == {
+        repr(data_set.setup) for data_set in data_sets
+    }
+    assert {data_sets[i].recording for i in few} == {data_set.recording for data_set in data_sets}
     # Of few short ones none can be spared.
-    assert glimpse.few(trials[:10]) == list(range(10))
+    assert excerpt.few(data_sets[:10]) == list(range(10))
 
 
 def test_what_few_records_say_is_a_start_for_all(nominal):
     machine = nominal.with_effect('encoder_zero', zero=0.0)
     records = _records(nominal, 20.0)
-    trials = _windows(nominal, records)
-    of_few = fit(machine, [trials[i] for i in glimpse.few(trials)])
-    start = glimpse.to_all(of_few, trials)
-    assert len(start.motions) == len(trials)
+    data_sets = _windows(nominal, records)
+    of_few = fit(machine, [data_sets[i] for i in excerpt.few(data_sets)])
+    start = excerpt.to_all(of_few, data_sets)
+    assert len(start.motions) == len(data_sets)
     # What belongs to a recording is one and the same in all its pieces.
     zeros = {}
-    for trial, motion in zip(trials, start.motions, strict=True):
-        zeros.setdefault(trial.recording, set()).add(float(motion[-1]))
+    for data_set, motion in zip(data_sets, start.motions, strict=True):
+        zeros.setdefault(data_set.recording, set()).add(float(motion[-1]))
     assert len(zeros) == 2
     assert all(len(values) == 1 for values in zeros.values())
-    again = fit(machine, trials, start=start)
+    again = fit(machine, data_sets, start=start)
     assert again.converged
     assert again.normalised_error < 1.1  # noise, within a few per cent at 5000 rows
-    back = glimpse.to_few(again, trials)
+    back = excerpt.to_few(again, data_sets)
     np.testing.assert_array_equal(back.motions[0], again.motions[0])
 
 
@@ -80,12 +82,12 @@ def test_a_look_at_short_records_finds_what_helps(nominal):
     base = fit(nominal, train)
     alone = Task(nominal, base=base)
     first = first_seconds(alone, train)
-    assert len(first.motions) == len(glimpse.few(train)) < len(train)
-    looks = {
-        name: look_at(Task(nominal, (name, None), base=base, first=first), train)
+    assert len(first.motions) == len(excerpt.few(train)) < len(train)
+    screenings = {
+        name: screen(Task(nominal, (name, None), base=base, first=first), train)
         for name in ('torque_bias', 'gyro_bias')
     }
-    assert looks['torque_bias'].error < 1.2 < looks['gyro_bias'].error
-    outcome = try_candidate(looks['torque_bias'].task, train, train[:3])
+    assert screenings['torque_bias'].error < 1.2 < screenings['gyro_bias'].error
+    outcome = try_candidate(screenings['torque_bias'].task, train, train[:3])
     assert outcome.train.normalised_error < 1.1
     assert outcome.train.model.values['torque_bias.bias'] == pytest.approx(1.5, rel=0.02)

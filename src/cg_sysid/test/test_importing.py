@@ -83,8 +83,9 @@ def test_bad_expressions(expression, message):
 def test_mat_and_json_read_as_csv_does(tmp_path):
     (tmp_path / 'log.csv').write_text('t,q\n0,1.5\n0.1,2.5\n')
     (tmp_path / 'log.json').write_text(json.dumps({'t': [0, 0.1], 'q': [1.5, 2.5], 'rate': 10}))
-    (tmp_path / 'rows.json').write_text(json.dumps(
-        {'entries': [{'t': 0, 'q': 1.5}, {'t': 0.1, 'q': 2.5}]}))
+    (tmp_path / 'rows.json').write_text(
+        json.dumps({'entries': [{'t': 0, 'q': 1.5}, {'t': 0.1, 'q': 2.5}]})
+    )
     scipy.io.savemat(tmp_path / 'log.mat', {'t': [0, 0.1], 'q': [1.5, 2.5], 'Ts': 0.1})
     expected = read_table(tmp_path / 'log.csv')
     for name in ('log.json', 'rows.json', 'log.mat'):
@@ -124,15 +125,18 @@ def test_bad_tables(tmp_path, name, content, message):
 
 
 LOG = 'trial,t_ms,angle,volt\n' + '\n'.join(
-    f'{k // 10},{5 * (k % 10)},{k},{2 * k}' for k in range(30))
+    f'{k // 10},{5 * (k % 10)},{k},{2 * k}' for k in range(30)
+)
 MAPPING = {
     'format': 'cg_import/1',
     'files': '*.csv',
     'mechanism': 'pendulum',
     'start': '2011-03-04T10:00:00Z',
     'time': {'column': 't_ms', 'unit': 'ms'},
-    'channels': {'angle': {'column': 'angle', 'unit': 'deg'},
-                 'torque': {'column': 'volt', 'gain': 0.5}},
+    'channels': {
+        'angle': {'column': 'angle', 'unit': 'deg'},
+        'torque': {'column': 'volt', 'gain': 0.5},
+    },
 }
 
 
@@ -149,8 +153,7 @@ def test_each_value_of_a_column_gets_its_own_record(tmp_path):
     records = [imported.record for imported in import_logs(path, tmp_path)]
     assert [record.name for record in records] == ['trial_00', 'trial_01', 'trial_02']
     for k, record in enumerate(records):
-        np.testing.assert_allclose(record.outputs['angle'],
-                                   np.deg2rad(10 * k + np.arange(2, 7)))
+        np.testing.assert_allclose(record.outputs['angle'], np.deg2rad(10 * k + np.arange(2, 7)))
         np.testing.assert_array_equal(record.inputs['torque'], 10 * k + np.arange(2, 7))
         np.testing.assert_array_equal(np.diff(record.stamp_ns), 5_000_000)
     assert records[0].stamp_ns[0] == 1_299_232_800 * NS_PER_S + 10_000_000
@@ -166,8 +169,9 @@ def test_pieces_of_one_recording_say_so_in_their_bags(tmp_path):
 
 
 def test_rows_can_be_chosen_and_time_can_be_a_rate(tmp_path):
-    path = write_mapping(tmp_path, rows=[{'column': 'trial', 'equals': 1}],
-                         time={'rate_hz': 200.0})
+    path = write_mapping(
+        tmp_path, rows=[{'column': 'trial', 'equals': 1}], time={'rate_hz': 200.0}
+    )
     (imported,) = import_logs(path, tmp_path)
     assert len(imported.record) == 10
     np.testing.assert_array_equal(np.diff(imported.record.stamp_ns), 5_000_000)
@@ -200,8 +204,11 @@ def test_a_fraction_of_a_second_counts(tmp_path):
 
 
 def test_a_record_can_be_cut_at_a_value(tmp_path):
-    path = write_mapping(tmp_path, time={'rate_hz': 200.0},
-                         split={'at': [{'column': 'angle', 'value': 12}], 'name': 'part_{part}'})
+    path = write_mapping(
+        tmp_path,
+        time={'rate_hz': 200.0},
+        split={'at': [{'column': 'angle', 'value': 12}], 'name': 'part_{part}'},
+    )
     lengths = {i.record.name: len(i.record) for i in import_logs(path, tmp_path)}
     assert lengths == {'part_1': 12, 'part_2': 18}
 
@@ -217,12 +224,12 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
         ({'time': {'column': 'nope'}}, "no column 'nope'"),
         ({'time': {}}, 'time: a column or rate_hz is needed'),
         ({'start': 'yesterday'}, "start: 'yesterday' is no time; an ISO 8601 time"),
-        ({'start': {'from_name': '%Y'}}, "start.from_name: the name of the file cannot be read"),
+        ({'start': {'from_name': '%Y'}}, 'start.from_name: the name of the file cannot be read'),
         ({'start': '2040-01-01'}, r'time: row 1 \(line 2\): 0 s after the start is no stamp'),
         ({'channels': ['angle']}, 'channels: a list of 1 is no mapping; a mapping from names'),
         ({'channels': None, 'time': {'rate_hz': 1.0}}, 'input torque is missing'),
         ({'files': '/etc/*'}, "files: '/etc/.*' is no pattern"),
-        ({'files': '../*.csv'}, "is no pattern"),
+        ({'files': '../*.csv'}, 'is no pattern'),
         ({'time': {'rate_hz': -1}}, 'time.rate_hz: -1 is not allowed; a positive number'),
         ({'rows': [{'column': 'trial', 'from': 'a'}]}, r"rows\[0\].from: 'a' is no number"),
         ({'rows': [{'column': 'trial'}]}, r'rows\[0\]: nothing to compare with'),
@@ -240,7 +247,7 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
         ({'channels': {'angle': 'angle', 'knee': 'volt'}}, "no channel 'knee'"),
         ({'channels': {'angle': 'angle'}, 'time': {'rate_hz': 1.0}}, 'input torque is missing'),
         ({'setup': {'stance': 'left'}}, "'left' is not one of"),
-        ({}, 'stamps must increase strictly'),  # the three trials start again at 0
+        ({}, 'stamps must increase strictly'),  # the three data sets start again at 0
     ],
 )
 def test_bad_mappings(tmp_path, changes, message):
@@ -293,8 +300,9 @@ def test_real_data_come_through_bags_unchanged_and_usable(tmp_path, name):
         back = read_bag(path)
         np.testing.assert_array_equal(back.stamp_ns, imported.record.stamp_ns)
         for channel, values in {**imported.record.inputs, **imported.record.outputs}.items():
-            np.testing.assert_allclose({**back.inputs, **back.outputs}[channel], values,
-                                       rtol=0.0, atol=1e-15)
+            np.testing.assert_allclose(
+                {**back.inputs, **back.outputs}[channel], values, rtol=0.0, atol=1e-15
+            )
         report = check_recording(path)
         assert report.verdict == 'warnings', report.findings  # when it was zeroed is not known
 
@@ -405,5 +413,6 @@ def test_the_signs_of_the_walking_steps_are_the_only_ones_that_fit():
     assert median_error(-1, -1, -1) == pytest.approx(right, rel=1e-6)
     for step in steps:
         lean = step.outputs['imu_angle'] - (
-            step.outputs['hip_angle'] if step.setup.stance == 'outer' else 0.0)
+            step.outputs['hip_angle'] if step.setup.stance == 'outer' else 0.0
+        )
         assert lean[0] < 0.0 < lean[-1]  # the hip passes over the foot, forward

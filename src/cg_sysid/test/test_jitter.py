@@ -10,7 +10,7 @@ from cg_interfaces.channels import mechanism
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.diagnosis.late_samples import late_samples
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 
 SIGMA = 4e-4  # s RMS
 RATE = 500.0
@@ -67,15 +67,15 @@ def test_noise_that_does_not_know_of_the_rate_is_no_jitter():
     assert not check_recording(recording(3, noise=2e-3, quantum=0.0)).of('jitter')
 
 
-def trial(raw, name):
-    """A recording as two windows of a trial."""
+def data_set(raw, name):
+    """A recording as two windows of a data set."""
     known = mechanism(raw.mechanism)
     topic = raw.topics[known.outputs[0].name]
     time = (topic.stamp_ns - topic.stamp_ns[0]) / 1e9
     outputs = np.column_stack([topic.values[n] for n in known.output_names])
     half = len(time) // 2
     return [
-        Trial(f'{name}_{k}', name, time[part] - time[part][0], np.zeros((half, 2)),
+        DataSet(f'{name}_{k}', name, time[part] - time[part][0], np.zeros((half, 2)),
               known.input_names, outputs[part], np.ones(2), Setup(), np.zeros(4), np.ones(4),
               since=float(time[part][0]))
         for k, part in enumerate((slice(0, half), slice(half, 2 * half)))
@@ -84,9 +84,9 @@ def trial(raw, name):
 
 def said(sigma):
     options = {**BODIES['double pendulum'], **SENSORS['noise']}
-    trials = [t for s in (1, 2) for t in trial(recording(s, sigma, **options), f'r{s}')]
+    data_sets = [t for s in (1, 2) for t in data_set(recording(s, sigma, **options), f'r{s}')]
     outputs = mechanism('double_pendulum').output_names
-    return late_samples(trials, 'double_pendulum', outputs, outputs[1], 'rad')
+    return late_samples(data_sets, 'double_pendulum', outputs, outputs[1], 'rad')
 
 
 def test_an_unexplained_error_is_told_what_timing_makes_of_it():

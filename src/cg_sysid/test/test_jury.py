@@ -12,8 +12,8 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import score
 from cg_sysid.search.candidates import Task, fit_to_all, try_candidate
-from cg_sysid.search.model_selection import Jury
-from cg_sysid.search.nuisance import with_imperfections
+from cg_sysid.search.model_selection import ModelSelection
+from cg_sysid.search.nuisance import with_nuisances
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 TWINS = 'foot_compliance', 'spring_nonlinearity'  # where springs may be off a little besides
@@ -21,7 +21,7 @@ TWINS = 'foot_compliance', 'spring_nonlinearity'  # where springs may be off a l
 
 @pytest.fixture(scope='module')
 def fitted(model_file):
-    """The jury, the nominal model's outcome, those of the twins, and all trials."""
+    """The jury, the nominal model's outcome, those of the twins, and all data sets."""
     nominal = Model.load(model_file)
     machine = nominal.with_effect('foot_compliance', stiffness=5.0)
     records = [
@@ -32,25 +32,25 @@ def fitted(model_file):
         )
         for k in range(2)
     ]  # fmt: skip
-    train, held = ([trial] for trial in prepare(nominal, records))
-    model, bounds = with_imperfections(nominal, [train[0].setup])
+    train, held = ([data_set] for data_set in prepare(nominal, records))
+    model, bounds = with_nuisances(nominal, [train[0].setup])
     base = try_candidate(Task(model, bounds=bounds), train, held)
     twins = [
         try_candidate(Task(model, (name, None), bounds=bounds, thorough=True), train, held)
         for name in TWINS
     ]
-    return Jury(train, held), base, twins, [*train, *held]
+    return ModelSelection(train, held), base, twins, [*train, *held]
 
 
-def _apart(contest):
-    one, other = (contest.of(name)[0].evidence for name in TWINS)
+def _apart(comparison):
+    one, other = (comparison.of(name)[0].evidence for name in TWINS)
     return one - other
 
 
 def test_a_joint_fit_is_at_least_as_good(fitted):
-    _, _, twins, trials = fitted
+    _, _, twins, data_sets = fitted
     for outcome in twins:
-        found = fit_to_all(outcome, trials)
+        found = fit_to_all(outcome, data_sets)
         mine = outcome.train.squares + outcome.held.squares + outcome.train.belief
         # What it gains is what values fitted to one half lose on the other, by chance.
         gain = mine - found.squares - found.belief
@@ -58,7 +58,7 @@ def test_a_joint_fit_is_at_least_as_good(fitted):
 
 
 def test_twins_are_level_wherever_their_fits_to_one_half_ended(fitted):
-    jury, base, (one, other), trials = fitted
+    selection, base, (one, other), data_sets = fitted
     # The half that is fitted may have led the one astray, as a wrong belief does here.
     values = {
         'foot_compliance.stiffness': 2.0 * one.train.model.values['foot_compliance.stiffness']
@@ -66,20 +66,20 @@ def test_twins_are_level_wherever_their_fits_to_one_half_ended(fitted):
     astray = replace(one.train, values=np.array([
         values.get(u.name, v) for u, v in zip(one.train.unknowns, one.train.values, strict=True)
     ]))  # fmt: skip
-    held = score(one.train.model.with_values(values), trials[1:])
+    held = score(one.train.model.with_values(values), data_sets[1:])
     one = replace(one, train=astray, held=held)
     twins = [one, other]
-    assert _apart(jury.contest(base, twins)) < -10
-    joint = jury.contest(base, twins, [fit_to_all(o, trials) for o in twins])
+    assert _apart(selection.comparison(base, twins)) < -10
+    joint = selection.comparison(base, twins, [fit_to_all(o, data_sets) for o in twins])
     assert abs(_apart(joint)) < 2
 
 
 def test_without_all_joint_fits_none_counts(fitted):
-    jury, base, twins, _ = fitted
+    selection, base, twins, _ = fitted
     much = replace(twins[0].train, mse=1e-3 * twins[0].train.mse)
-    joint = jury.contest(base, twins, [much, 'runs away'])
-    assert _apart(joint) == _apart(jury.contest(base, twins))
-    assert joint.margin <= jury.contest(base, twins).margin
+    joint = selection.comparison(base, twins, [much, 'runs away'])
+    assert _apart(joint) == _apart(selection.comparison(base, twins))
+    assert joint.margin <= selection.comparison(base, twins).margin
 
 
 def _leaving(o, train, held):
@@ -91,18 +91,18 @@ def _leaving(o, train, held):
 
 
 def test_nothing_can_be_earned_where_too_little_is_left(fitted):
-    jury, base, _, _ = fitted
-    assert jury.nothing_material(_leaving(base, 1.0, 1.85))
-    assert jury.nothing_material(_leaving(base, 30.0, 1.85))
-    assert not jury.nothing_material(_leaving(base, 1.0, 1.95))
+    selection, base, _, _ = fitted
+    assert selection.nothing_material(_leaving(base, 1.0, 1.85))
+    assert selection.nothing_material(_leaving(base, 30.0, 1.85))
+    assert not selection.nothing_material(_leaving(base, 1.0, 1.95))
     one = _leaving(base, 1.0, 1.0)
     one.held.mse[:, 1] = 2.1
-    assert not jury.nothing_material(one)
+    assert not selection.nothing_material(one)
 
 
 def test_what_is_earned_explains_something_of_the_records_that_it_is_fitted_to(fitted):
-    jury, base, _, _ = fitted
+    selection, base, _, _ = fitted
     # One output in three, three tenths of a squared standard deviation.
-    assert jury.to_be_earned(_leaving(base, 9.0, 9.0)) == pytest.approx(8.9, abs=0.01)
-    assert jury.to_be_earned(_leaving(base, 1.1, 9.0)) == pytest.approx(1.07, abs=1e-6)
-    assert jury.to_be_earned(_leaving(base, 0.9, 9.0)) == pytest.approx(0.9, abs=1e-6)
+    assert selection.to_be_earned(_leaving(base, 9.0, 9.0)) == pytest.approx(8.9, abs=0.01)
+    assert selection.to_be_earned(_leaving(base, 1.1, 9.0)) == pytest.approx(1.07, abs=1e-6)
+    assert selection.to_be_earned(_leaving(base, 0.9, 9.0)) == pytest.approx(0.9, abs=1e-6)

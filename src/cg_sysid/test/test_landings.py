@@ -18,7 +18,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.walking.contact import Ground, contact_law
 from cg_dynamics.walking.gait import section_state
-from cg_sysid.checks.loading import Intake
+from cg_sysid.checks.loading import Loaded
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.identification.data_set import noise_floor
@@ -58,9 +58,7 @@ def machine(ground=(), other=()):
 @functools.cache
 def recorded(ground, other, seeds, duration=2.1):
     model = machine(ground, other)
-    walks = [
-        walking(model, seed, duration, stance=('inner', 'outer')[seed % 2]) for seed in seeds
-    ]
+    walks = [walking(model, seed, duration, stance=('inner', 'outer')[seed % 2]) for seed in seeds]
     return [
         as_record(f'walk_{seed}', done, done.arcs[0].stance, seed)
         for seed, done in zip(seeds, walks, strict=True)
@@ -213,7 +211,7 @@ def test_the_ground_is_named_in_a_robot_of_other_numbers(ground):
     assert abs(estimate - value) < 4 * spread + 0.01 * value
     assert (found.landings.after < found.landings.before).all()
     assert contact_law(found.extended.train.model) != ContactLaw()
-    facts = diagnosis_facts(found, Intake(cut.records, (), cut.origin), {})
+    facts = diagnosis_facts(found, Loaded(cut.records, (), cut.origin), {})
     page = card(facts)
     assert page.count('<circle') == 2 * len(facts['landings']['impulses']) > 0
     assert ('cone of friction' in page) == (effect == 'foot_slip')

@@ -36,7 +36,7 @@ def test_a_true_cause_gains_from_measured_starts_too_to_the_end_of_a_stable_reco
     found = answer.measured_start
     assert found.whole
     assert found.helps
-    assert set(found.carried) == {trial.name for trial in answer.held}
+    assert set(found.carried) == {data_set.name for data_set in answer.held}
     by_channel = {g.channel: g for g in found.gains}
     hip = by_channel['hip_angle']
     assert hip.after < 0.5 * hip.before
@@ -51,9 +51,9 @@ def test_a_robot_that_falls_is_judged_as_far_as_its_start_carries(nominal):
     machine = nominal.with_effect('torque_constant', error=0.2)
     fall = [0.002, 0.01, 0.0, 0.0]
     made = [record(machine, k, Setup('inner'), fall, 2.0, 1.6) for k in range(2)]
-    trials = prepare(nominal, made)
-    before, after = score(nominal, trials), score(machine, trials)
-    found = judged(nominal.mechanism, trials, before, after)
+    data_sets = prepare(nominal, made)
+    before, after = score(nominal, data_sets), score(machine, data_sets)
+    found = judged(nominal.mechanism, data_sets, before, after)
     assert not found.whole
     assert all(0.08 <= seconds < 1.6 for seconds in found.carried.values())
 
@@ -62,13 +62,13 @@ def test_a_cause_that_only_fitted_starts_like_is_doubted(nominal):
     setup = Setup('inner', springs=SPRINGS)
     machine = nominal.with_effect('torque_constant', error=0.2)
     made = [record(machine, k, setup, [0.1, -0.1, 0.3, -0.5]) for k in range(2)]
-    trials = [led_in(trial) for trial in prepare(nominal, made)]
-    fitted = score(nominal, trials)
-    found = judged(nominal.mechanism, trials, fitted, replace(fitted))
+    data_sets = [led_in(data_set) for data_set in prepare(nominal, made)]
+    fitted = score(nominal, data_sets)
+    found = judged(nominal.mechanism, data_sets, fitted, replace(fitted))
     assert not found.helps
     assert 'That is no gain' in found.text
     # A start that is known to a tenth of a rad judges nothing.
-    vague = [replace(t, motion_noise=0.01 * np.eye(len(t.motion))) for t in trials]
+    vague = [replace(t, motion_noise=0.01 * np.eye(len(t.motion))) for t in data_sets]
     assert judged(nominal.mechanism, vague, fitted, fitted) is None
 
 
@@ -76,9 +76,9 @@ def test_a_model_whose_encoder_is_off_starts_where_it_reads_what_was_measured(no
     setup = Setup('inner', springs=SPRINGS)
     machine = nominal.with_effect('encoder_offset', offset=0.03)
     made = [record(machine, k, setup, [0.1, -0.1, 0.3, -0.5], duration=2.0) for k in range(2)]
-    trials = prepare(nominal, made)
-    before, after = score(nominal, trials), score(machine, trials)
-    found = judged(nominal.mechanism, trials, before, after)
+    data_sets = prepare(nominal, made)
+    before, after = score(nominal, data_sets), score(machine, data_sets)
+    found = judged(nominal.mechanism, data_sets, before, after)
     assert found.whole
     by_channel = {g.channel: g for g in found.gains}
     hip = by_channel['hip_angle']

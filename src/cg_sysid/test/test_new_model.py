@@ -44,8 +44,12 @@ def test_template_explains_every_parameter_and_names_every_effect(name):
 @pytest.mark.parametrize('name', MECHANISMS)
 def test_what_is_commented_out_is_right_once_it_is_filled_in(name):
     lines = template(name).split('\n')
-    filled = [line.replace('# ', '', 1).replace('value: ...', 'value: 0.5')
-              if 'value: ...' in line or line.startswith('# - name: ') else line for line in lines]
+    filled = [
+        line.replace('# ', '', 1).replace('value: ...', 'value: 0.5')
+        if 'value: ...' in line or line.startswith('# - name: ')
+        else line
+        for line in lines
+    ]
     model = Model.from_text('\n'.join(filled), name)
     assert {e.name for e in model.effects} == {
         n for n, effect in LIBRARY.items() if effect.sites(model.mechanism)

@@ -33,8 +33,9 @@ def test_a_direction_that_rounding_has_lost_is_no_failure():
     # An unstable motion: both unknowns move the end of the record, only their sum is seen, and
     # what is believed of each (1e4) lies below the last digit of 1e30.
     steep = np.full((2, 2), 1e30)
-    h, gradient, factors = reduced(_point(steep + 1e4 * np.eye(2), np.ones((2, 1)),
-                                          np.array([2e10, 2e10])), 0.0)
+    h, gradient, factors = reduced(
+        _point(steep + 1e4 * np.eye(2), np.ones((2, 1)), np.array([2e10, 2e10])), 0.0
+    )
     assert np.isfinite(h).all()
     assert np.isfinite(gradient).all()
     # The sum of the unknowns goes where the data say, by equal shares.
@@ -51,8 +52,8 @@ def _short_pieces(machine, sample_time):
 def test_a_wrong_simulation_starts_where_it_errs_least(model_file):
     nominal = Model.load(model_file)
     machine = nominal.with_effect('cogging_torque', amplitude=20.0, cycles=9.0, phase=0.3)
-    trials = prepare(nominal, _short_pieces(machine, 0.004))
-    best, found = (fit(nominal, trials, only=[], reweight=weighs) for weighs in (False, True))
+    data_sets = prepare(nominal, _short_pieces(machine, 0.004))
+    best, found = (fit(nominal, data_sets, only=[], reweight=weighs) for weighs in (False, True))
     assert best.normalised_error > 1000
     # The guesses of the initial motions are believed no more than the samples behind them.
     assert found.normalised_error == pytest.approx(best.normalised_error, rel=1e-3)

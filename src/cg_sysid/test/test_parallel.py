@@ -99,9 +99,9 @@ def test_a_fit_in_threads_is_the_same_to_the_bit(model_file):
         )
         for k in range(3)
     ]  # fmt: skip
-    trials = prepare(nominal, records)
-    (beside,) = run_all(fit, [(nominal, trials)], workers=2)
-    alone = fit(nominal, trials)
+    data_sets = prepare(nominal, records)
+    (beside,) = run_all(fit, [(nominal, data_sets)], workers=2)
+    alone = fit(nominal, data_sets)
     assert beside.evaluations == alone.evaluations
     np.testing.assert_array_equal(beside.values, alone.values)
     np.testing.assert_array_equal(beside.covariance, alone.covariance)

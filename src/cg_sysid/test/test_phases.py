@@ -11,7 +11,7 @@ from walking_records import as_record
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.loading import load_bags
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.experiments.rehearsal import rehearse
@@ -193,7 +193,7 @@ def test_both_stances_are_trained_on_and_held_out(nominal):
     done = walking(nominal, seed=1)
     cut = cut_steps([as_record('walk', done, 'inner')], nominal)
     for side in split(prepare(nominal, cut.records)):
-        assert {trial.setup.stance for trial in side} == {'inner', 'outer'}
+        assert {data_set.setup.stance for data_set in side} == {'inner', 'outer'}
 
 
 def test_bags_of_a_walking_robot_pass_the_check_and_are_cut(nominal, tmp_path):
@@ -202,9 +202,9 @@ def test_bags_of_a_walking_robot_pass_the_check_and_are_cut(nominal, tmp_path):
         done = walking(on(nominal, ground), seed=k, duration=2.2)
         bags.append(write_bag(tmp_path / ground, as_record(ground, done, 'inner', k)))
         assert check_recording(bags[-1], MODEL).verdict != 'unusable'
-    intake = take_in(bags, MODEL)
-    assert not intake.left_out
-    assert set(intake.steps) == set(GROUNDS)
-    assert set(intake.origin.values()) == set(GROUNDS)
-    assert all(record.name in intake.origin for record in intake.records)
-    assert len(intake.records) > len(intake.landings)
+    loaded = load_bags(bags, MODEL)
+    assert not loaded.left_out
+    assert set(loaded.steps) == set(GROUNDS)
+    assert set(loaded.origin.values()) == set(GROUNDS)
+    assert all(record.name in loaded.origin for record in loaded.records)
+    assert len(loaded.records) > len(loaded.landings)

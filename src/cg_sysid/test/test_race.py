@@ -19,8 +19,8 @@ from cg_sysid.search.candidates import (
     try_candidate,
 )
 from cg_sysid.search.events import undisturbed
-from cg_sysid.search.nuisance import with_imperfections
-from cg_sysid.search.successive_halving import IDLE, Race, worth_having
+from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.successive_halving import IDLE, SuccessiveHalving, worth_having
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values
@@ -38,7 +38,7 @@ def _machine(nominal, *effects):
     return machine
 
 
-def _trials(nominal, machine, seconds=8.0):
+def _data_sets(nominal, machine, seconds=8.0):
     records = [
         rehearse(
             f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
@@ -54,21 +54,23 @@ PUSH = ('external_push', {'impulse': -3.0, 'instant': 4.3, 'duration': 0.1})
 
 
 def test_pieces_leave_out_what_begins_without_samples(nominal):
-    trial = _trials(nominal, nominal, seconds=6.5)[0]
-    gap = (trial.time > 1.9) & (trial.time < 2.1)
-    spoilt = replace(trial, outputs=np.where(gap[:, None], np.nan, trial.outputs))
+    data_set = _data_sets(nominal, nominal, seconds=6.5)[0]
+    gap = (data_set.time > 1.9) & (data_set.time < 2.1)
+    spoilt = replace(data_set, outputs=np.where(gap[:, None], np.nan, data_set.outputs))
     found = pieces(nominal.mechanism, spoilt, 2.0)
     assert [begin for begin, _ in found] == pytest.approx([0.0, 4.0], abs=0.005)
-    missing = replace(trial, outputs=np.where(trial.time[:, None] < 2.0, np.nan, trial.outputs))
+    missing = replace(
+        data_set, outputs=np.where(data_set.time[:, None] < 2.0, np.nan, data_set.outputs)
+    )
     assert [begin for begin, _ in pieces(nominal.mechanism, missing, 2.0)] == pytest.approx(
         [2.0, 4.0], abs=0.005
     )
-    assert not pieces(nominal.mechanism, _trials(nominal, nominal, seconds=0.6)[0], 2.0)
+    assert not pieces(nominal.mechanism, _data_sets(nominal, nominal, seconds=0.6)[0], 2.0)
 
 
 def test_a_push_in_records_too_short_for_pieces(nominal):
     machine = _machine(nominal, ('external_push', {**PUSH[1], 'instant': 0.4}))
-    train, held = ([trial] for trial in _trials(nominal, machine, seconds=0.9))
+    train, held = ([data_set] for data_set in _data_sets(nominal, machine, seconds=0.9))
     outcome = try_candidate(Task(nominal, ('external_push', None)), train, held)
     # Held-out records take the model's own numbers for certain: their intervals are too narrow.
     of_fitted = events_of(outcome, 'external_push')[train[0].name]
@@ -79,24 +81,24 @@ def test_a_push_in_records_too_short_for_pieces(nominal):
 
 
 def test_a_fit_out_of_reach_is_broken_off(nominal):
-    trials = _trials(nominal, _machine(nominal, PUSH))
-    patient, hasty = (fit(nominal, trials, reach=reach) for reach in (np.inf, 3.0))
+    data_sets = _data_sets(nominal, _machine(nominal, PUSH))
+    patient, hasty = (fit(nominal, data_sets, reach=reach) for reach in (np.inf, 3.0))
     assert hasty.evaluations < patient.evaluations
     assert not hasty.converged
     assert min(hasty.normalised_error, patient.normalised_error) > 30.0  # both are hopeless
 
 
 def test_a_fit_that_comes_into_reach_is_not(nominal):
-    trials = _trials(nominal, _machine(nominal))
-    patient, hasty = (fit(nominal, trials, reach=reach) for reach in (np.inf, 3.0))
+    data_sets = _data_sets(nominal, _machine(nominal))
+    patient, hasty = (fit(nominal, data_sets, reach=reach) for reach in (np.inf, 3.0))
     np.testing.assert_array_equal(hasty.values, patient.values)
     assert hasty.converged
 
 
 def test_numbers_of_pieces_that_nothing_spoils(nominal):
     machine = _machine(nominal, PUSH)
-    trials = _trials(nominal, machine)
-    calm, spoilt = undisturbed(nominal, trials, {}), fit(nominal, trials)
+    data_sets = _data_sets(nominal, machine)
+    calm, spoilt = undisturbed(nominal, data_sets, {}), fit(nominal, data_sets)
     away = {
         name: [abs(f.model.values[name] / machine.values[name] - 1) for f in (calm, spoilt)]
         for name in OFF
@@ -113,51 +115,53 @@ def test_numbers_of_pieces_that_nothing_spoils(nominal):
 )
 def test_what_is_wrong_all_the_time_did_not_happen(nominal, effects):
     bare = nominal.without_effect('coulomb_friction')
-    assert undisturbed(bare, _trials(bare, _machine(bare, *effects)), {}) is None
+    assert undisturbed(bare, _data_sets(bare, _machine(bare, *effects)), {}) is None
 
 
 def test_a_look_serves_beside_other_small_faults_too(nominal):
     """What every robot has a little of is let go when the cause is known: no need to look anew."""
-    train = _trials(nominal, _machine(nominal, ('payload', {'mass': 1.0})), seconds=5.0)
+    train = _data_sets(nominal, _machine(nominal, ('payload', {'mass': 1.0})), seconds=5.0)
     asked = []
 
     def carry_out(function, arguments, what):
         asked.append((what, len(arguments)))
         return [function(*a) for a in arguments]
 
-    race = Race(train, train, carry_out)
-    model, bounds = with_imperfections(nominal, [trial.setup for trial in train])
+    halving = SuccessiveHalving(train, train, carry_out)
+    model, bounds = with_nuisances(nominal, [data_set.setup for data_set in train])
     faulty = Task(model, ('payload', None), bounds=bounds)
-    (look,) = race.look([faulty], 'beside small faults')
+    (screening,) = halving.screen([faulty], 'beside small faults')
     lean = Task(nominal, ('payload', None))
-    (same,) = race.look_beside([lean], 'alone')
+    (same,) = halving.screen_beside([lean], 'alone')
     assert asked == [('beside small faults', 1), ('alone', 0)]
     assert same.task.model is nominal
-    own = {u.name for u in look.task.leads[0].unknowns}
-    assert own - {u.name for u in same.task.leads[0].unknowns} == set(bounds)
+    own = {u.name for u in screening.task.warm_starts[0].unknowns}
+    assert own - {u.name for u in same.task.warm_starts[0].unknowns} == set(bounds)
     # It is a start for a fit of this structure, and a good one.
     outcome = try_candidate(replace(same.task, iterations=8), train, train)
     assert outcome.train.normalised_error == pytest.approx(1.0, abs=0.05)
     # Another base is another matter.
     other = Task(nominal.with_effect('torque_bias'), ('payload', None))
-    race.look_beside([other], 'on top of another cause')
+    halving.screen_beside([other], 'on top of another cause')
     assert asked[-1] == ('on top of another cause', 1)
 
 
 def test_an_event_is_sought_before_all_others_are_fitted(nominal):
-    trials = _trials(nominal, _machine(nominal, PUSH), seconds=10.0)
+    data_sets = _data_sets(nominal, _machine(nominal, PUSH), seconds=10.0)
     done = []
 
     def carry_out(function, arguments, what):
         done.append(what.rpartition(', ')[2])
         return [function(*a) for a in arguments]
 
-    train, held = trials[:1], trials[1:]
+    train, held = data_sets[:1], data_sets[1:]
     base = try_candidate(Task(nominal), train, held)
     task = Task(nominal, base=base.train)
     task = replace(task, first=first_seconds(task, train))
     names = ('external_push', 'gyro_bias', 'torque_bias', 'imu_offset')
-    found, _ = Race(train, held, carry_out).run(task, [(n, None) for n in names], 'race')
+    found, _ = SuccessiveHalving(train, held, carry_out).run(
+        task, [(n, None) for n in names], 'race'
+    )
     best = min(found, key=lambda o: o.train.normalised_error)
     assert best.label == 'external_push'
     assert best.held.normalised_error == pytest.approx(1.0, abs=0.05)
@@ -166,20 +170,20 @@ def test_an_event_is_sought_before_all_others_are_fitted(nominal):
 
 def test_a_base_is_led_out_of_a_local_minimum(nominal):
     """As play has many, what is put on top of it would seem to help."""
-    train = _trials(nominal, _machine(nominal, ('torque_constant', {'error': 0.1})))
+    train = _data_sets(nominal, _machine(nominal, ('torque_constant', {'error': 0.1})))
     model = nominal.with_effect('torque_constant')
     alone = Task(model, base=fit(model, train))
     alone = replace(alone, first=first_seconds(alone, train))
     stuck = replace(alone.first, mse=4 * alone.first.mse)
     effects = [('payload', None), ('torque_bias', None)]
-    race = Race(train, train, _one_after_the_other)
-    assert race.lead_deeper(alone, effects, 'a fit at its minimum') is None
-    lead = race.lead_deeper(replace(alone, first=stuck), effects, 'a fit that is stuck')
-    assert lead.normalised_error == pytest.approx(alone.first.normalised_error, rel=0.01)
-    assert [u.name for u in lead.unknowns] == [u.name for u in alone.first.unknowns]
+    halving = SuccessiveHalving(train, train, _one_after_the_other)
+    assert halving.lead_deeper(alone, effects, 'a fit at its minimum') is None
+    warm_start = halving.lead_deeper(replace(alone, first=stuck), effects, 'a fit that is stuck')
+    assert warm_start.normalised_error == pytest.approx(alone.first.normalised_error, rel=0.01)
+    assert [u.name for u in warm_start.unknowns] == [u.name for u in alone.first.unknowns]
     # The first seconds fit, all of the record does not: from there it is tried again.
     lost = replace(alone, base=replace(alone.base, mse=4 * alone.base.mse))
-    assert race.lead_deeper(lost, effects, 'a fit that got lost') is alone.first
+    assert halving.lead_deeper(lost, effects, 'a fit that got lost') is alone.first
 
 
 def _one_after_the_other(function, arguments, what):
@@ -187,7 +191,7 @@ def _one_after_the_other(function, arguments, what):
 
 
 def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):
-    base = fit(nominal, _trials(nominal, _machine(nominal), 2.0))
+    base = fit(nominal, _data_sets(nominal, _machine(nominal), 2.0))
     leaving = replace(base, mse=np.full_like(base.mse, 1.06))
     assert worth_having(1.06, leaving) == worth_having(np.inf, leaving) == pytest.approx(1.06)
     assert worth_having(1.01, leaving) == pytest.approx(1.06 - 0.05 * IDLE)

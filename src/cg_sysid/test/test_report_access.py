@@ -100,9 +100,7 @@ def test_what_is_drawn_or_pressed_has_a_name(page):
     assert all(e.attributes.get('role') == 'img' for e in page.all('svg'))
     # An arrow is no name.
     pressed = page.all('button')
-    assert all(
-        e.attributes.get('aria-label') or re.search(r'\w', e.text) for e in pressed
-    )
+    assert all(e.attributes.get('aria-label') or re.search(r'\w', e.text) for e in pressed)
     assert all(e.attributes.get('aria-label') or e.within('label') for e in page.all('select'))
     assert all(e.within('label') for e in page.all('input'))
     groups = [e for e in page.elements if e.attributes.get('role') == 'group']
@@ -129,6 +127,7 @@ def _colours(style):
 
 def _contrast(a, b):
     """Ratio of relative luminances (WCAG 2.2)."""
+
     def luminance(colour):
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

@@ -10,7 +10,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels, topics
 from cg_interfaces.channels import JOINT_STATE, Channel, Mechanism, Topic
-from cg_sysid.checks.loading import take_in
+from cg_sysid.checks.loading import load_bags
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.cli.diagnose import diagnosis_curves
 from cg_sysid.diagnosis.diagnose import diagnose
@@ -55,11 +55,11 @@ def bags(monkeypatch, tmp_path):
 
 def test_friction_of_a_rail_is_identified_in_its_unit(bags, tmp_path):
     (tmp_path / 'cart.yaml').write_text(FILE)
-    records = take_in(bags, tmp_path / 'cart.yaml').records
+    records = load_bags(bags, tmp_path / 'cart.yaml').records
     model = cart().with_effect('quadratic_friction', coefficient=0.1)
-    trials = prepare(model, records)
-    assert trials[0].sigma[0] == pytest.approx(1e-4, rel=0.3)
-    found = fit(model, trials)
+    data_sets = prepare(model, records)
+    assert data_sets[0].sigma[0] == pytest.approx(1e-4, rel=0.3)
+    found = fit(model, data_sets)
     names = [u.name for u in found.unknowns]
     index = names.index('quadratic_friction.coefficient')
     assert found.unknowns[index].unit == 'N s^2/m^2'
@@ -70,11 +70,11 @@ def test_friction_of_a_rail_is_identified_in_its_unit(bags, tmp_path):
 def test_diagnosis_and_report_speak_of_metres_and_newtons(bags, tmp_path):
     path = tmp_path / 'cart.yaml'
     path.write_text(FILE)
-    intake = take_in(bags, path)
+    loaded = load_bags(bags, path)
     options = Options(effects=('quadratic_friction', 'torque_bias'), rounds=1, workers=1)
-    found = diagnose(Model.load(path), intake.records, options)
+    found = diagnose(Model.load(path), loaded.records, options)
     made = provenance(path, ['diagnose', 'bags'], {}, '2011-03-13T07:00:00Z')
-    facts = diagnosis_facts(found, intake, made)
+    facts = diagnosis_facts(found, loaded, made)
     assert facts['causes'][0]['name'] == 'quadratic_friction'
     assert facts['causes'][0]['parameters']['coefficient']['unit'] == 'N s^2/m^2'
     assert (facts['inputs'], facts['input_units']) == (['force'], ['N'])

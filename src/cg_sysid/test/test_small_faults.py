@@ -13,8 +13,8 @@ from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.search.candidates import Task, look_at, one_minimum
-from cg_sysid.search.nuisance import SOUND, as_sound_robots, imperfect, with_imperfections
+from cg_sysid.search.candidates import Task, one_minimum, screen
+from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
 from cg_sysid.search.ranking import MARGIN
 
 EFFECTS = (
@@ -189,30 +189,30 @@ def test_an_effect_by_another_law_is_that_effect_and_not_two(
 
 
 def test_small_faults_stay_within_their_bounds(nominal):
-    model, bounds = with_imperfections(nominal, [_springs(200.0)])
-    assert imperfect(model, bounds) == {
+    model, bounds = with_nuisances(nominal, [_springs(200.0)])
+    assert nuisances(model, bounds) == {
         'actuator_delay', 'encoder_offset', 'imu_offset', 'spring_stiffness',
         'spring_stiffness@spring1',
     }  # fmt: skip
     # What the file itself states is no small fault.
     stated = nominal.with_effect('encoder_offset', offset=0.01)
-    assert 'encoder_offset' not in imperfect(*with_imperfections(stated, [_springs(200.0)]))
+    assert 'encoder_offset' not in nuisances(*with_nuisances(stated, [_springs(200.0)]))
 
 
 def test_other_starts_of_a_cause_have_the_unknowns_of_its_fit(nominal):
     """A friction with a smoothing of its own, which is a small fault even where it is a cause."""
     machine = nominal.with_effect('asymmetric_friction', excess=0.3)
-    trials = prepare(nominal, _records(machine, 5.0)[:2])
+    data_sets = prepare(nominal, _records(machine, 5.0)[:2])
     effect = ('asymmetric_friction', None)
-    model, bounds = with_imperfections(nominal.with_effect(*effect), [_springs(200.0)])
+    model, bounds = with_nuisances(nominal.with_effect(*effect), [_springs(200.0)])
     assert 'asymmetric_friction.transition_rate' in bounds
-    whole = fit(model, trials, bounds=bounds, iterations=2)
+    whole = fit(model, data_sets, bounds=bounds, iterations=2)
     task = Task(model.without_effect(effect[0]), effect, bounds=bounds)
-    lead = look_at(task, trials).task.leads[0]
-    assert {u.name for u in lead.unknowns} == {u.name for u in whole.unknowns}
+    warm_start = screen(task, data_sets).task.warm_starts[0]
+    assert {u.name for u in warm_start.unknowns} == {u.name for u in whole.unknowns}
     assert one_minimum(whole, whole, effect[0])
     # Fits of other structures are compared too, and are not one minimum.
-    assert not one_minimum(whole, fit(nominal, trials, iterations=2), effect[0])
+    assert not one_minimum(whole, fit(nominal, data_sets, iterations=2), effect[0])
 
 
 @pytest.mark.parametrize('late', ['actuator_delay', 'sensor_delay'])

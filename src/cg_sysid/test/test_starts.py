@@ -53,9 +53,9 @@ def test_a_wave_is_reported_in_one_form(model_file, phase):
     # A sin(x + phase) is also -A sin(x + phase + pi), and so is every turn more.
     nominal = Model.load(model_file)
     machine = nominal.with_effect('encoder_eccentricity', amplitude=-0.04, phase=phase)
-    trials = prepare(nominal, [_record(machine, k) for k in range(2)])
+    data_sets = prepare(nominal, [_record(machine, k) for k in range(2)])
     found, same = (
-        fit(nominal.with_effect('encoder_eccentricity', amplitude=a, phase=p), trials)
+        fit(nominal.with_effect('encoder_eccentricity', amplitude=a, phase=p), data_sets)
         for a, p in ((-0.02, phase + 0.3), (0.02, phase + math.pi + 0.3))
     )
     values = found.model.values
@@ -84,11 +84,13 @@ def test_every_record_has_its_own_push(model_file):
                 'external_push', impulse=impulse, instant=instant, duration=0.08
             )
         records.append(_record(machine, k))
-    trials = prepare(nominal, records)
-    outcome = try_candidate(Task(nominal, ('external_push', None)), trials[::2], trials[1::2])
+    data_sets = prepare(nominal, records)
+    outcome = try_candidate(
+        Task(nominal, ('external_push', None)), data_sets[::2], data_sets[1::2]
+    )
     # As a diagnosis does with those in reach: seek again with better parameters.
-    again = replace(outcome.task, leads=(outcome.train,))
-    outcome = try_candidate(again, trials[::2], trials[1::2])
+    again = replace(outcome.task, warm_starts=(outcome.train,))
+    outcome = try_candidate(again, data_sets[::2], data_sets[1::2])
     # Noise alone gives 1, within a few percent at a thousand rows.
     assert outcome.held.normalised_error < 1.2
     for k in range(4):
@@ -117,10 +119,12 @@ def _slow_sweep(machine, k):
     [
         ('joint_flexibility', {'stiffness': 115.0, 'rotor_inertia': 0.09, 'damping': 0.7}),
         ('joint_flexibility', {'stiffness': 300.0, 'rotor_inertia': 0.15, 'damping': 0.4}),
-        pytest.param('backlash', {'gap': 0.007, 'rotor_inertia': 0.14},
-                     marks=pytest.mark.evidence),
-        pytest.param('backlash', {'gap': 0.058, 'rotor_inertia': 0.06},
-                     marks=pytest.mark.evidence),
+        pytest.param(
+            'backlash', {'gap': 0.007, 'rotor_inertia': 0.14}, marks=pytest.mark.evidence
+        ),
+        pytest.param(
+            'backlash', {'gap': 0.058, 'rotor_inertia': 0.06}, marks=pytest.mark.evidence
+        ),
     ],
 )
 def test_found_where_the_first_seconds_mislead(model_file, effect, values):
@@ -140,10 +144,10 @@ def test_a_curved_valley_is_followed_to_its_end(model_file, start):
     off = {'c4': 1.11 * nominal.values['c4'], 'c5': 0.85 * nominal.values['c5']}
     hidden = {'stiffness': 115.0, 'rotor_inertia': 0.09, 'damping': 0.7}
     machine = nominal.with_values(off).with_effect('joint_flexibility', **hidden)
-    trials = prepare(nominal, [_slow_sweep(machine, k) for k in range(2)])
+    data_sets = prepare(nominal, [_slow_sweep(machine, k) for k in range(2)])
     at = {'stiffness': start, 'rotor_inertia': 0.1, 'damping': 0.3}
     found = fit(
-        nominal.with_effect('joint_flexibility'), trials, thorough=True,
+        nominal.with_effect('joint_flexibility'), data_sets, thorough=True,
         iterations=THOROUGH_ITERATIONS,
         at={f'joint_flexibility.{name}': value for name, value in at.items()},
     )  # fmt: skip
@@ -166,8 +170,8 @@ def test_intervals_hold_what_they_promise(model_file):
         true['encoder_offset.offset'] = 0.003 * rng.uniform(-1, 1)
         model = nominal.with_effect('encoder_offset')
         machine = model.with_values(true)
-        trials = prepare(nominal, [_record(machine, 10 * seed + k) for k in range(3)])
-        found = fit(model, trials, thorough=True)
+        data_sets = prepare(nominal, [_record(machine, 10 * seed + k) for k in range(3)])
+        found = fit(model, data_sets, thorough=True)
         off = found.values - [true.get(u.name, u.prior) for u in found.unknowns]
         # Numbers that nothing perturbed are where the file believes: they would flatter.
         moved = [u.name in true for u in found.unknowns]
@@ -199,21 +203,21 @@ def test_pieces_that_begin_in_motion(model_file, effect, values, settled):
         )
         for k in range(2)
     ]  # fmt: skip
-    trials = [
+    data_sets = [
         piece
-        for trial in prepare(nominal, records)
-        for _, piece in pieces(nominal.mechanism, trial, 1.0)
+        for data_set in prepare(nominal, records)
+        for _, piece in pieces(nominal.mechanism, data_set, 1.0)
     ]
-    true = score(machine, trials)
+    true = score(machine, data_sets)
     assert true.normalised_error < 1.1  # noise alone gives 1, within 3 % at 4000 samples
     errors = []
-    for trial, own in zip(trials, true.motions, strict=True):
+    for data_set, own in zip(data_sets, true.motions, strict=True):
         at_rest = np.concatenate([own[:4], np.zeros(len(own) - 4)])
-        residual = (predict(machine, trial, at_rest) - trial.outputs) / trial.sigma
+        residual = (predict(machine, data_set, at_rest) - data_set.outputs) / data_set.sigma
         errors.append(np.nanmean(residual**2))
     assert np.mean(errors) > settled
     away = nominal.with_effect(effect, **{name: 1.3 * value for name, value in values.items()})
-    found = fit(away, trials)
+    found = fit(away, data_sets)
     assert found.normalised_error < 1.1
     for u, value, sigma in zip(found.unknowns, found.values, found.sigmas, strict=True):
         true_value = machine.values[u.name]

@@ -20,15 +20,15 @@ from cg_sysid.search.nuisance import turning
 def test_model_gets_torque_time_and_switches_in_its_order(model_file):
     nominal = Model.load(model_file)
     record = rehearse('swing', nominal, Setup('inner', 'inner_fixed'), [0.2, 0.5], [np.sin], 0.3)
-    (trial,) = prepare(nominal, [record])
+    (data_set,) = prepare(nominal, [record])
     asking = nominal.with_effect('friction_drift').with_effect('back_emf')
-    names = compile_model(asking, trial.setup).input_names
+    names = compile_model(asking, data_set.setup).input_names
     assert names == ('hip_torque', 'time', 'session_time', 'drive_enabled')
-    inputs = trial.inputs_for(names)
+    inputs = data_set.inputs_for(names)
     np.testing.assert_array_equal(inputs[:, 0], record.inputs['hip_torque'])
     # A clock is held from row to row as the torque is: at the middle.
-    np.testing.assert_allclose(inputs[:, 1], trial.time + 0.001)
-    np.testing.assert_allclose(inputs[:, 2], trial.time + 0.001)
+    np.testing.assert_allclose(inputs[:, 1], data_set.time + 0.001)
+    np.testing.assert_allclose(inputs[:, 2], data_set.time + 0.001)
     np.testing.assert_array_equal(inputs[:, 3], 1.0)
 
 
@@ -64,14 +64,14 @@ def test_late_torque_and_late_readings_are_told_apart_by_nothing(model_file):
                  [lambda t, k=k: steps[int(25 * t) + 70 * k]], 3.0, seed=k)
         for k in range(2)
     ]  # fmt: skip
-    trials = [
+    data_sets = [
         replace(t, outputs=np.where(t.time[:, None] < 0.1, np.nan, t.outputs))
         for t in prepare(nominal, records)
     ]
     chi2 = {}
     for name in ('actuator_delay', 'sensor_delay'):
         for thorough in (False, True):
-            found = fit(nominal.with_effect(name), trials, only=[f'{name}.delay', 'c1', 'c4'],
+            found = fit(nominal.with_effect(name), data_sets, only=[f'{name}.delay', 'c1', 'c4'],
                         thorough=thorough)  # fmt: skip
             chi2[name, thorough] = (found.mse * found.count).sum()
     apart = [abs(chi2['actuator_delay', t] - chi2['sensor_delay', t]) for t in (False, True)]
@@ -107,11 +107,13 @@ def test_time_goes_on_through_all_pieces_of_a_recording(model_file):
         'swing', machine, setup, [0.2, 0.5], [lambda t: 3 * np.sin(5 * t)], 8.0, 0.004
     )
     parts = [piece for half in whole.segments(4.0) for piece in half.segments(2.0)]
-    trials = prepare(nominal, parts)
-    assert [trial.since for trial in trials] == pytest.approx([0.0, 2.0, 4.0, 6.0], abs=0.003)
-    clocks = np.concatenate([trial.inputs_for((TIME,))[:, 0] for trial in trials])
+    data_sets = prepare(nominal, parts)
+    assert [data_set.since for data_set in data_sets] == pytest.approx(
+        [0.0, 2.0, 4.0, 6.0], abs=0.003
+    )
+    clocks = np.concatenate([data_set.inputs_for((TIME,))[:, 0] for data_set in data_sets])
     np.testing.assert_allclose(clocks, whole.time + 0.002, atol=1e-9)
-    found = fit(nominal.with_effect('imu_drift'), trials, only=['imu_drift.rate'])
+    found = fit(nominal.with_effect('imu_drift'), data_sets, only=['imu_drift.rate'])
     assert found.normalised_error == pytest.approx(1.0, abs=0.05)
     assert abs(found.values[0] - 0.01) < 4 * found.sigmas[0] < 0.001
 
@@ -128,10 +130,10 @@ def test_recordings_that_follow_one_another_are_a_session(model_file):
         ]
 
     late, first, second = taken(60.0, 0.0, 4.5)
-    trials = prepare(nominal, [late, *first.segments(2.0), *second.segments(2.0)])
-    assert [t.session for t in trials] == pytest.approx([60.0, 0.0, 0.0, 4.5, 4.5])
-    clock = trials[-1].inputs_for((SESSION_TIME,))[:, 0]
-    np.testing.assert_allclose(clock, 4.5 + trials[-1].since + trials[-1].time + 0.002)
+    data_sets = prepare(nominal, [late, *first.segments(2.0), *second.segments(2.0)])
+    assert [t.session for t in data_sets] == pytest.approx([60.0, 0.0, 0.0, 4.5, 4.5])
+    clock = data_sets[-1].inputs_for((SESSION_TIME,))[:, 0]
+    np.testing.assert_allclose(clock, 4.5 + data_sets[-1].since + data_sets[-1].time + 0.002)
     # Two robots at once, or simulated ones whose clocks begin anew: whose session would it be?
     assert {t.session for t in prepare(nominal, taken(0.0, 3.9, 60.0))} == {0.0}
 
@@ -142,9 +144,9 @@ def test_a_push_is_found_in_the_piece_that_it_hit_and_by_the_time_of_the_recordi
     machine = nominal.with_effect('external_push', impulse=2.0, instant=7.3, duration=0.1)
     whole = rehearse('pushed', machine, Setup(springs=springs), [0.1, -0.1, 0.3, -0.5],
                      [lambda t: 4 * np.sin(5 * t)], 12.0, 0.004)  # fmt: skip
-    trials = prepare(nominal, whole.segments(4.0))
-    outcome = try_candidate(Task(nominal, ('external_push', None)), trials[1:], trials[:1])
+    data_sets = prepare(nominal, whole.segments(4.0))
+    outcome = try_candidate(Task(nominal, ('external_push', None)), data_sets[1:], data_sets[:1])
     events = events_of(outcome, 'external_push')
-    assert max(events, key=lambda name: events[name]['impulse'][0]) == trials[1].name
-    value, sigma, _ = events[trials[1].name]['instant']
+    assert max(events, key=lambda name: events[name]['impulse'][0]) == data_sets[1].name
+    value, sigma, _ = events[data_sets[1].name]['instant']
     assert abs(value - 7.3) < 4 * sigma + 0.005

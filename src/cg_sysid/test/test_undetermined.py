@@ -18,7 +18,7 @@ from cg_sysid.identification.identify import fit
 from cg_sysid.learned.shape import Shape
 from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search.candidates import Task, try_candidate
-from cg_sysid.search.model_selection import Jury
+from cg_sysid.search.model_selection import ModelSelection
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFT = {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.6}
@@ -65,22 +65,24 @@ def test_the_summary_says_so():
 def test_a_size_that_is_not_determined_is_no_cause(nominal):
     """A motor that gives 1 N m and another loss: a limit explains nothing, whatever it gains."""
     machine = nominal.with_effect('quadratic_friction', coefficient=0.05)
-    trials = prepare(nominal, [
+    data_sets = prepare(nominal, [
         rehearse(
             f'record_{k}', machine, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
             [lambda t, k=k: math.sin(2 * math.pi * (0.5 + 0.1 * k + 0.4 * t) * t)], 6.0, 0.004, k,
         )
         for k in range(2)
     ])  # fmt: skip
-    train, held = trials[:1], trials[1:]
+    train, held = data_sets[:1], data_sets[1:]
     base, limited = (
         try_candidate(Task(nominal, effect), train, held)
         for effect in (None, ('torque_saturation', None))
     )
-    judged = Jury(train, held).judge(base, limited, gained=1e3)
+    judged = ModelSelection(train, held).judge(base, limited, gained=1e3)
     assert 'is not determined' in judged.reason
     quadratic = try_candidate(Task(nominal, ('quadratic_friction', None)), train, held)
-    assert 'determined' not in Jury(train, held).judge(base, quadratic, gained=1e3).reason
+    assert (
+        'determined' not in ModelSelection(train, held).judge(base, quadratic, gained=1e3).reason
+    )
 
 
 @pytest.mark.parametrize(
@@ -117,7 +119,7 @@ def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):
 
 def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):
     machine = nominal.with_effect('actuator_lag', time_constant=0.01)
-    trials = prepare(nominal, [
+    data_sets = prepare(nominal, [
         rehearse(
             f'record_{k}', machine, Setup(springs=SPRINGS), [0.1, -0.1, 0.3, -0.5],
             [lambda t, k=k: 9 * math.sin(2 * math.pi * (0.5 + 0.1 * k + 0.4 * t) * t)], 4.0, 0.004,
@@ -125,7 +127,7 @@ def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):
         )
         for k in range(2)
     ])  # fmt: skip
-    train, held = trials[:1], trials[1:]
+    train, held = data_sets[:1], data_sets[1:]
     base, soft = (
         try_candidate(Task(model, effect, iterations=1), train, held)
         for model, effect in ((nominal, None), (nominal, ('joint_flexibility', None)))
@@ -134,6 +136,6 @@ def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):
         name = 'joint_flexibility.stiffness'
         model = soft.train.model.with_values({name: stiffness})
         fitted = replace(soft, train=replace(soft.train, model=model))
-        reason = Jury(train, held).judge(base, fitted, gained=1e3).reason
+        reason = ModelSelection(train, held).judge(base, fitted, gained=1e3).reason
         assert told in reason
         assert ('winds up' in reason) == bool(told)

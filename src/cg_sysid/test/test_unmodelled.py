@@ -87,9 +87,7 @@ def test_what_takes_less_than_half_of_the_error_is_no_explanation(nominal):
     assert answer.verdict == 'unexplained', answer.summary
     assert answer.unmodelled is None
     (cause,) = answer.causes
-    before, after = (
-        m.held.normalised_error - 1 for m in (answer.baseline, answer.extended)
-    )
+    before, after = (m.held.normalised_error - 1 for m in (answer.baseline, answer.extended))
     assert 0.5 * before < after < before
     assert f'{100 * (1 - after / before):.0f} % of the squared error' in answer.summary
     assert f'{cause.label} (error = ' in answer.summary

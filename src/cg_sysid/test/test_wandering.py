@@ -9,7 +9,7 @@ from test_diagnosis_file import documented
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.checks.loading import Intake
+from cg_sysid.checks.loading import Loaded
 from cg_sysid.diagnosis.by_recording import numbers_of, with_own
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
@@ -52,8 +52,8 @@ def test_grease_that_warms_over_a_session_is_seen(nominal):
         assert abs(value - level) < 4 * sigma + 0.01 * level
     assert found.wandering.explained > 0.99
     assert 'falling in the order of their names' in found.summary
-    intake = Intake(tuple(records), (), {r.name: r.name for r in records})
-    told = diagnosis_facts(found, intake, {})['wandering']
+    loaded = Loaded(tuple(records), (), {r.name: r.name for r in records})
+    told = diagnosis_facts(found, loaded, {})['wandering']
     assert set(told) == documented('wandering')
     assert {r: v['value'] for r, v in told['values'].items()} == {
         r: value for r, (value, _) in found.wandering.values.items()
@@ -107,12 +107,12 @@ def test_what_is_wrong_with_the_machine_does_not_wander(nominal):
 
 
 def test_every_number_of_the_library_can_be_asked_for(nominal):
-    trials = prepare(nominal, _session([nominal] * 2))
-    asked = list(numbers_of(nominal, trials, None))
+    data_sets = prepare(nominal, _session([nominal] * 2))
+    asked = list(numbers_of(nominal, data_sets, None))
     assert len(asked) > 15
     for name, at in asked:
         model = with_own(nominal, name, at, nominal)
         (own,) = own_unknowns(model)
         assert own.each == 'recording'
         assert own.name.partition('.')[0].partition('@')[0] == name
-        fit(model, trials, iterations=1, horizon=0.5)
+        fit(model, data_sets, iterations=1, horizon=0.5)

@@ -199,6 +199,7 @@ class SensorTerm(LearnedEffect):
     @classmethod
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
         """Channels of that unit; with a colon, the reading or torque that the error follows."""
+
         def reading(unit: str) -> tuple[str, ...]:
             alike = (unit, sliding_unit(unit))
             units = zip(mechanism.outputs, mechanism.output_units, strict=True)

@@ -70,12 +70,16 @@ class CompassGait(Mechanism):
         moment_rate = (
             c4 * normal(q[0]) * v[0] + c5 * normal(q[1]) * v[1] - 2 * c6 * normal(q3) * both
         )
-        kinetic = mt * l**2 * (
-            ca.sumsqr(hip_rate) / (2 * l**2)
-            + (c1 - c3) * v[0] ** 2 / 2
-            + (c2 - c3) * v[1] ** 2 / 2
-            + c3 * both**2 / 2
-            - ca.dot(hip_rate, moment_rate) / l
+        kinetic = (
+            mt
+            * l**2
+            * (
+                ca.sumsqr(hip_rate) / (2 * l**2)
+                + (c1 - c3) * v[0] ** 2 / 2
+                + (c2 - c3) * v[1] ** 2 / 2
+                + c3 * both**2 / 2
+                - ca.dot(hip_rate, moment_rate) / l
+            )
         )
         moment = c4 * direction(q[0]) + c5 * direction(q[1]) - 4 * c6 * direction(q3)
         potential = mt * g * ca.dot(up, hip - l * moment)

@@ -58,8 +58,9 @@ class Mechanism(ABC):
     def slides(self, joint: str) -> bool:
         """Whether a joint moves along a line: its position is in m, what acts on it in N."""
         row = self.joints[joint]
-        return any(share and q in self.sliding
-                   for q, share in zip(self.coordinates, row, strict=True))
+        return any(
+            share and q in self.sliding for q, share in zip(self.coordinates, row, strict=True)
+        )
 
     @property
     def input_units(self) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from cg_dynamics.rollout.vector_code import (
 
 log = logging.getLogger(__name__)
 
+
 @dataclass(frozen=True)
 class Feedback:
     """A time-varying linear feedback on top of the torques, as TVLQR gives it.

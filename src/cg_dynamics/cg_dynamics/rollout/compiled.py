@@ -314,9 +314,7 @@ class CompiledModel:
         if column.shape != (len(self.free),) or column.max(initial=-1) >= nc:
             raise ValueError(f'column must place {len(self.free)} parameters below {nc}')
         delay_columns = [_delay_column(row, column) for row in jacobian]
-        normal = Normal(
-            np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0
-        )
+        normal = Normal(np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0)
         y = np.full((m, self.ny), np.nan) if keep else None
         j = np.zeros((m, self.ny, nc)) if keep else None
         done = self._c.cgm_normal(

@@ -144,7 +144,12 @@ def rebound(
 
 
 def _struck(
-    model: Model, stance: str, x: np.ndarray, v4: np.ndarray, law: ContactLaw, ground: Ground,
+    model: Model,
+    stance: str,
+    x: np.ndarray,
+    v4: np.ndarray,
+    law: ContactLaw,
+    ground: Ground,
     landing: bool,
 ) -> Impact:
     results = foot_functions(model, stance, landing)(x[:2], v4, parameters(model))
@@ -181,9 +186,7 @@ def foot_functions(model: Model, stance: str, landing: bool) -> ca.Function:
         A = ca.jacobian(e.swing_foot if landing else e.q[2:], e.q)
         G = ca.solve(e.mass_matrix, A.T)
         q = ca.SX.sym('q', 2)
-        out = ca.substitute(
-            [ca.mtimes(A, e.v), ca.mtimes(A, G), G], [e.q], [ca.vertcat(q, 0, 0)]
-        )
+        out = ca.substitute([ca.mtimes(A, e.v), ca.mtimes(A, G), G], [e.q], [ca.vertcat(q, 0, 0)])
         _feet[key] = ca.Function('foot', [q, e.v, e.p], [ca.densify(part) for part in out])
     return _feet[key]
 
@@ -245,17 +248,13 @@ def _build(model: Model, stance: str) -> FreeFoot:
 
     def step(name: str, force: ca.SX) -> ca.Function:
         more = ca.mtimes(G, force - held)
-        rates = ca.vertcat(
-            pinned.rates[:2], dv + more[:2], pinned.rates[4:], rate, more[2:]
-        )
+        rates = ca.vertcat(pinned.rates[:2], dv + more[:2], pinned.rates[4:], rate, more[2:])
         f = ca.Function('f', [y, u, p, c, slope], [ca.cse(rates)])
         k1 = f(y, u, p, c, slope)
         k2 = f(y + h / 2 * k1, u, p, c, slope)
         k3 = f(y + h / 2 * k2, u, p, c, slope)
         k4 = f(y + h * k3, u, p, c, slope)
-        return ca.Function(
-            name, [y, u, p, h, c, slope], [y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)]
-        )
+        return ca.Function(name, [y, u, p, h, c, slope], [y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
 
     return FreeFoot(
         ca.Function('force', [x, u, p], [held]),

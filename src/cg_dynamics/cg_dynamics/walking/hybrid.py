@@ -394,8 +394,7 @@ class Walker:
             force = self._force(leg, x, u)
             self.asked = asked
             self.answer = float(
-                self.law.friction * (force @ self.ground.normal)
-                - abs(force @ self.ground.tangent)
+                self.law.friction * (force @ self.ground.normal) - abs(force @ self.ground.tangent)
             )
         return self.answer
 

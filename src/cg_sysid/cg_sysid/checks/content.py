@@ -15,8 +15,14 @@ from cg_sysid.records.raw import RawRecording
 from cg_sysid.records.record import NS_PER_S
 
 WANTED = (
-    'experiment', 'nominal_rate_hz', 'sensor_zeros', 'zeroed_at', 'initial_state', 'model_file',
-    'model_sha256', 'software',
+    'experiment',
+    'nominal_rate_hz',
+    'sensor_zeros',
+    'zeroed_at',
+    'initial_state',
+    'model_file',
+    'model_sha256',
+    'software',
 )
 ZERO_AGE_S = 24 * 3600.0  # sensor zeros older than this are stale, in s
 START_S = 0.06  # the start of a recording, in s
@@ -62,17 +68,28 @@ def _topics(raw: RawRecording) -> Iterator[Finding]:
     tied = raw.setup.fixture == 'legs_tied'
     if APPLIED_TORQUE not in raw.topics and not tied:
         if TORQUE_COMMAND in raw.topics:
-            yield Finding('topic_missing', 'warning', APPLIED_TORQUE,
-                          'missing; the torque command is used as the input instead')
+            yield Finding(
+                'topic_missing',
+                'warning',
+                APPLIED_TORQUE,
+                'missing; the torque command is used as the input instead',
+            )
         else:
-            yield Finding('topic_missing', 'error', APPLIED_TORQUE,
-                          f'missing, and there is no {TORQUE_COMMAND} either')
+            yield Finding(
+                'topic_missing',
+                'error',
+                APPLIED_TORQUE,
+                f'missing, and there is no {TORQUE_COMMAND} either',
+            )
     present = [topic for topic in known.outputs if topic.name in raw.topics]
     for topic in known.outputs:
         if topic not in present:
-            yield Finding('topic_missing', 'warning' if present else 'error', topic.name,
-                          'missing; its channels are '
-                          + ', '.join(c.name for c in topic.channels))
+            yield Finding(
+                'topic_missing',
+                'warning' if present else 'error',
+                topic.name,
+                'missing; its channels are ' + ', '.join(c.name for c in topic.channels),
+            )
 
 
 def _note(raw: RawRecording) -> Iterator[Finding]:
@@ -81,13 +98,23 @@ def _note(raw: RawRecording) -> Iterator[Finding]:
     if 'setup' not in raw.note:
         missing.insert(0, 'setup')
     if missing:
-        yield Finding('metadata_missing', 'warning' if 'setup' in missing else 'info', '',
-                      f'the note does not say {", ".join(missing)}', value=missing)
+        yield Finding(
+            'metadata_missing',
+            'warning' if 'setup' in missing else 'info',
+            '',
+            f'the note does not say {", ".join(missing)}',
+            value=missing,
+        )
     zeroed_at = raw.note.get('zeroed_at')
     when = _instant(zeroed_at)
     if when is None:
-        yield Finding('zeroing_unknown', 'warning', '', 'when the sensors were zeroed is not '
-                      f'known (zeroed_at: {zeroed_at!r}); an ISO 8601 time is needed')
+        yield Finding(
+            'zeroing_unknown',
+            'warning',
+            '',
+            'when the sensors were zeroed is not '
+            f'known (zeroed_at: {zeroed_at!r}); an ISO 8601 time is needed',
+        )
         return
     stamps = [int(t.stamp_ns.min()) for t in raw.topics.values() if len(t)]
     if not stamps:
@@ -95,8 +122,14 @@ def _note(raw: RawRecording) -> Iterator[Finding]:
     age = min(stamps) / NS_PER_S - when
     if age > ZERO_AGE_S or age < -60.0:
         text = f'{age / 3600.0:.1f} h before' if age > 0 else f'{-age / 3600.0:.1f} h after'
-        yield Finding('zeroing_stale', 'warning', '', f'the sensors were zeroed {text} the '
-                      'recording', value=age, allowed=ZERO_AGE_S)
+        yield Finding(
+            'zeroing_stale',
+            'warning',
+            '',
+            f'the sensors were zeroed {text} the recording',
+            value=age,
+            allowed=ZERO_AGE_S,
+        )
 
 
 def _instant(value: object) -> float | None:
@@ -114,8 +147,13 @@ def _instant(value: object) -> float | None:
 def _model(raw: RawRecording, model: Path) -> Iterator[Finding]:
     recorded = raw.note.get('model_sha256')
     if recorded and hashlib.sha256(model.read_bytes()).hexdigest() != recorded:
-        yield Finding('model_differs', 'info', '', f'recorded with another version of the model '
-                      f'than {model.name} (its hash is not the one in the note)')
+        yield Finding(
+            'model_differs',
+            'info',
+            '',
+            f'recorded with another version of the model '
+            f'than {model.name} (its hash is not the one in the note)',
+        )
 
 
 def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
@@ -139,18 +177,35 @@ def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     moving = [n for n, (_, v, s) in begins.items() if abs(v) > REST_RATE + s]
     for name in moving if raw.note.get('initial_state') == 'rest' else ():
         rate = begins[name][1]
-        yield Finding('not_at_rest', 'warning', name, f'the note says that the motion starts from '
-                      f'rest, but this moves at {rate:.3g} {signals[name].unit}/s', 0.0, START_S,
-                      0, rate, REST_RATE)
+        yield Finding(
+            'not_at_rest',
+            'warning',
+            name,
+            f'the note says that the motion starts from '
+            f'rest, but this moves at {rate:.3g} {signals[name].unit}/s',
+            0.0,
+            START_S,
+            0,
+            rate,
+            REST_RATE,
+        )
     free = raw.mechanism == 'compass_gait' and raw.setup.fixture == 'none'
     if free and not raw.setup.springs and 'imu_angle' in begins and not moving:
         lean = begins['imu_angle'][0] - (
             begins.get('hip_angle', (0.0,))[0] if raw.setup.stance == 'outer' else 0.0
         )
         if abs(lean) < UPRIGHT:
-            yield Finding('poor_start', 'warning', 'imu_angle', 'starts at rest near the upright: '
-                          'a small change decides which way it falls', 0.0, START_S, 0, lean,
-                          UPRIGHT)
+            yield Finding(
+                'poor_start',
+                'warning',
+                'imu_angle',
+                'starts at rest near the upright: a small change decides which way it falls',
+                0.0,
+                START_S,
+                0,
+                lean,
+                UPRIGHT,
+            )
 
 
 def _slope(signal: Signal) -> np.ndarray:
@@ -174,25 +229,40 @@ def _coverage(
             continue
         low, high = (float(q) for q in np.quantile(values, [0.01, 0.99]))
         covered[name] = (low, high)
-        yield Finding('coverage', 'info', name, f'98 % lie in {low:.4g} .. {high:.4g}',
-                      value=[low, high])
+        yield Finding(
+            'coverage', 'info', name, f'98 % lie in {low:.4g} .. {high:.4g}', value=[low, high]
+        )
     for name, (low, high) in use_region.items():
         if name not in covered:
-            yield Finding('coverage_unknown', 'warning', name,
-                          f'not in this recording, which has {", ".join(covered)}')
+            yield Finding(
+                'coverage_unknown',
+                'warning',
+                name,
+                f'not in this recording, which has {", ".join(covered)}',
+            )
             continue
         shared = min(high, covered[name][1]) - max(low, covered[name][0])
         share = max(0.0, shared) / (high - low) if high > low else 0.0
         if share < WELL_COVERED:
-            yield Finding('coverage_poor', 'warning', name,
-                          f'the data cover {share:.0%} of {low:.4g} .. {high:.4g}, where the '
-                          'model will be used', value=share, allowed=WELL_COVERED)
+            yield Finding(
+                'coverage_poor',
+                'warning',
+                name,
+                f'the data cover {share:.0%} of {low:.4g} .. {high:.4g}, where the '
+                'model will be used',
+                value=share,
+                allowed=WELL_COVERED,
+            )
     known = mechanism(raw.mechanism)
     angles = [signals[n] for n in known.output_names if n in signals and n.endswith('angle')]
     moved = [np.ptp(s.values) > LITTLE_MOTION * max(s.noise.sigma_floor, 1e-6) for s in angles]
     if angles and not any(moved):
-        yield Finding('no_motion', 'warning', '', 'nothing moves: no parameter of motion can be '
-                      'identified from this recording')
+        yield Finding(
+            'no_motion',
+            'warning',
+            '',
+            'nothing moves: no parameter of motion can be identified from this recording',
+        )
 
 
 def _excitation(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
@@ -209,10 +279,15 @@ def _excitation(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Findi
         share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
         low, high = (float(frequency[np.searchsorted(share, q)]) for q in (0.05, 0.95))
         rms = float(np.sqrt(np.mean(signal.values**2)))
-        yield Finding('excitation', 'info', name, f'rms {rms:.4g} {signal.unit}, '
-                      f'peak {peak:.4g} {signal.unit}, 90 % of the power in {low:.3g} .. '
-                      f'{high:.3g} Hz',
-                      value=[rms, peak, low, high])
+        yield Finding(
+            'excitation',
+            'info',
+            name,
+            f'rms {rms:.4g} {signal.unit}, '
+            f'peak {peak:.4g} {signal.unit}, 90 % of the power in {low:.3g} .. '
+            f'{high:.3g} Hz',
+            value=[rms, peak, low, high],
+        )
 
 
 def _spectrum(signal: Signal) -> tuple[np.ndarray, np.ndarray]:
@@ -230,8 +305,13 @@ def _closed_loop(
 ) -> Iterator[Finding]:
     """Torques that are made of the measured state."""
     if raw.note.get('closed_loop') is True:
-        yield Finding('closed_loop', 'warning', '', 'recorded under feedback, says the note: '
-                      'delays and noise of the loop bias an identification')
+        yield Finding(
+            'closed_loop',
+            'warning',
+            '',
+            'recorded under feedback, says the note: '
+            'delays and noise of the loop bias an identification',
+        )
         return
     for name in mechanism(raw.mechanism).input_names:
         if name not in signals or np.ptp(signals[name].values) == 0.0:
@@ -249,6 +329,13 @@ def _closed_loop(
         fit = design @ np.linalg.lstsq(design, torque.values, rcond=None)[0]
         explained = 1.0 - float(np.var(torque.values - fit) / np.var(torque.values))
         if explained > FEEDBACK:
-            yield Finding('closed_loop', 'warning', name, f'{explained:.0%} of the torque follows '
-                          'from angles and rates: it looks like feedback, which biases an '
-                          'identification', value=explained, allowed=FEEDBACK)
+            yield Finding(
+                'closed_loop',
+                'warning',
+                name,
+                f'{explained:.0%} of the torque follows '
+                'from angles and rates: it looks like feedback, which biases an '
+                'identification',
+                value=explained,
+                allowed=FEEDBACK,
+            )

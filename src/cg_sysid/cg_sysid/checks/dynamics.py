@@ -106,16 +106,37 @@ def _broken(
         end = float(signals[own[0]].time[-1])
         begin = float(signals[own[0]].time[0])
         for at in _places(motion):
-            best = min(best, (_spread_out(signals, own, torque, angle, at, 1.0, short),
-                              'dropped_samples', topic, at))
+            best = min(
+                best,
+                (
+                    _spread_out(signals, own, torque, angle, at, 1.0, short),
+                    'dropped_samples',
+                    topic,
+                    at,
+                ),
+            )
         whole = 1.0 + short / (end - begin)
-        best = min(best, (_spread_out(signals, own, torque, angle, begin, whole),
-                          'dropped_samples', topic, begin))
+        best = min(
+            best,
+            (
+                _spread_out(signals, own, torque, angle, begin, whole),
+                'dropped_samples',
+                topic,
+                begin,
+            ),
+        )
         for ratio in RATES:
             at = end - short / (ratio - 1.0)
             if at > begin:
-                best = min(best, (_spread_out(signals, own, torque, angle, at, ratio),
-                                  'sampling_rate_change', topic, at))
+                best = min(
+                    best,
+                    (
+                        _spread_out(signals, own, torque, angle, at, ratio),
+                        'sampling_rate_change',
+                        topic,
+                        at,
+                    ),
+                )
         if best[0] < MISALIGNED * law.unexplained:
             yield _restored(*best[1:], law.unexplained, best[0])
             return
@@ -135,7 +156,7 @@ def _left(motion: Motion, torque: str, angle: str, at: float) -> float:
 
 def _changes(motion: Motion, torque: str, angle: str, law: Law) -> bool:
     """Whether a part of the recording follows a law that the whole does not."""
-    for at in _places(motion)[::PLACES // SPLITS]:
+    for at in _places(motion)[:: PLACES // SPLITS]:
         rows = motion.away_from(at)
         for part in (rows & (motion.time < at), rows & (motion.time > at)):
             if part.sum() < FEWEST:
@@ -157,9 +178,17 @@ def _restored(code: str, where: str, at: float, before: float, after: float) -> 
         'dropped_samples': 'lacks samples from here on that its stamps do not show',
     }[code]
     return Finding(
-        code, 'error', where, f'{where or "the recording"} {what}: so read, the motion follows '
+        code,
+        'error',
+        where,
+        f'{where or "the recording"} {what}: so read, the motion follows '
         f'one law, which leaves {after:.1%} of the acceleration instead of {before:.1%}',
-        at, None, None, before, after)
+        at,
+        None,
+        None,
+        before,
+        after,
+    )
 
 
 def _short_topics(raw: RawRecording, signals: dict[str, Signal]) -> dict[str, float]:
@@ -216,12 +245,18 @@ def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Findi
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
     if abs(missing) > MOVED * error and alike:
         held = rests(joint, step.time - RESTING_S, step.time + RESTING_S)
-        yield Finding('zero_shift', 'warning' if held else 'error', torque.channel,
-                      f'jumps by {step.size:.3g} {torque.unit}, which {angle} does not answer'
-                      + (', but it rests there, and friction may hold it' if held else ''),
-                      float(torque.time[step.sample - 1]), step.time,
-                      int(torque.sample[step.sample]), step.size,
-                      MOVED * error / abs(law.factor))
+        yield Finding(
+            'zero_shift',
+            'warning' if held else 'error',
+            torque.channel,
+            f'jumps by {step.size:.3g} {torque.unit}, which {angle} does not answer'
+            + (', but it rests there, and friction may hold it' if held else ''),
+            float(torque.time[step.sample - 1]),
+            step.time,
+            int(torque.sample[step.sample]),
+            step.size,
+            MOVED * error / abs(law.factor),
+        )
 
 
 def _clipped(
@@ -234,7 +269,7 @@ def _clipped(
     for first, last in runs:
         if first >= 2 and last <= len(beyond) - 3:
             guess = over_gap(signal.time, signal.values, first - 1, last + 1)
-            beyond[first: last + 1] = guess - signal.values[first: last + 1]
+            beyond[first : last + 1] = guess - signal.values[first : last + 1]
     if not beyond.any():
         return
     lost = replace(signal, values=beyond)
@@ -245,7 +280,15 @@ def _clipped(
     answered, error = float(law.extra[0]), float(law.extra_error[0])
     if answered > ANSWERED * error and answered > CLIPPED * law.factor > 0:
         first, last = max(runs, key=lambda run: run[1] - run[0])
-        yield Finding('sensor_clipping', 'error', torque, f'is recorded as no more than '
-                      f'{signal.values[first]:.4g} {signal.unit}, but {angle} answers more',
-                      float(signal.time[first]), float(signal.time[last]),
-                      int(signal.sample[first]), answered / law.factor, CLIPPED)
+        yield Finding(
+            'sensor_clipping',
+            'error',
+            torque,
+            f'is recorded as no more than '
+            f'{signal.values[first]:.4g} {signal.unit}, but {angle} answers more',
+            float(signal.time[first]),
+            float(signal.time[last]),
+            int(signal.sample[first]),
+            answered / law.factor,
+            CLIPPED,
+        )

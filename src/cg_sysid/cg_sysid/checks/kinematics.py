@@ -81,12 +81,18 @@ def check_kinematics(signals: dict[str, Signal]) -> Iterator[Finding]:
             scale = 1.0 / _slope(integrated, turned)
             yield from _scale(scale)
         else:
-            yield Finding('rate_mismatch', 'warning', 'imu_rate',
-                          f'the rate is not the derivative of imu_angle (correlation '
-                          f'{correlation:.2f})', value=correlation, allowed=CORRELATED)
+            yield Finding(
+                'rate_mismatch',
+                'warning',
+                'imu_rate',
+                f'the rate is not the derivative of imu_angle (correlation {correlation:.2f})',
+                value=correlation,
+                allowed=CORRELATED,
+            )
             moves = False
-    stuck = list(_stuck(imu.angle, imu.time, imu.values, integrated / scale, turned, span,
-                        imu.noise))
+    stuck = list(
+        _stuck(imu.angle, imu.time, imu.values, integrated / scale, turned, span, imu.noise)
+    )
     yield from stuck
     if not stuck:
         shifts = list(_shift_of_rate(imu, moves))
@@ -159,17 +165,33 @@ def _change_of_scale(
     at = float(imu.time[k * span])
     if before * after < 0:
         # The channel that changed its sign is the one that jumps to its mirror image, or both.
-        return Finding('sign_error', 'error', 'imu_rate' if after < 0 else 'imu_angle',
-                       'imu_rate is the derivative of imu_angle in one part of the recording, and '
-                       'its negative in the other', at, float(imu.time[-1]),
-                       int(imu.sample[k * span]), after, before)
+        return Finding(
+            'sign_error',
+            'error',
+            'imu_rate' if after < 0 else 'imu_angle',
+            'imu_rate is the derivative of imu_angle in one part of the recording, and '
+            'its negative in the other',
+            at,
+            float(imu.time[-1]),
+            int(imu.sample[k * span]),
+            after,
+            before,
+        )
     ratio = after / before
     if 1.0 / SCALE_CHANGE < ratio < SCALE_CHANGE:
         return None
-    return Finding('sampling_rate_change', 'error', imu.angle.topic,
-                   f'from here on the angle turns {ratio:.2f} times as far as its rate says, as '
-                   'it did not before: the stamps are wrong', at, float(imu.time[-1]),
-                   int(imu.sample[k * span]), ratio, 1.0)
+    return Finding(
+        'sampling_rate_change',
+        'error',
+        imu.angle.topic,
+        f'from here on the angle turns {ratio:.2f} times as far as its rate says, as '
+        'it did not before: the stamps are wrong',
+        at,
+        float(imu.time[-1]),
+        int(imu.sample[k * span]),
+        ratio,
+        1.0,
+    )
 
 
 def _scale(scale: float) -> Iterator[Finding]:
@@ -177,12 +199,23 @@ def _scale(scale: float) -> Iterator[Finding]:
         return
     for factor, what in ((DEGREES, 'the rate is in deg/s'), (1 / DEGREES, 'the angle is in deg')):
         if abs(scale / factor - 1.0) < UNIT_TOLERANCE:
-            yield Finding('unit', 'error', 'imu_rate', f'imu_rate is {scale:.3g} times the '
-                          f'derivative of imu_angle: {what}', value=scale, allowed=1.0)
+            yield Finding(
+                'unit',
+                'error',
+                'imu_rate',
+                f'imu_rate is {scale:.3g} times the derivative of imu_angle: {what}',
+                value=scale,
+                allowed=1.0,
+            )
             return
-    yield Finding('scale', 'warning', 'imu_rate',
-                  f'imu_rate is {scale:.3g} times the derivative of imu_angle', value=scale,
-                  allowed=1.0)
+    yield Finding(
+        'scale',
+        'warning',
+        'imu_rate',
+        f'imu_rate is {scale:.3g} times the derivative of imu_angle',
+        value=scale,
+        allowed=1.0,
+    )
 
 
 def _shift_of_angle(imu: Imu, integral: np.ndarray) -> Iterator[Finding]:
@@ -194,25 +227,35 @@ def _shift_of_angle(imu: Imu, integral: np.ndarray) -> Iterator[Finding]:
     late = timing_errors({s.channel: s for s in (imu.angle, imu.rate)})
     sigma = noise.sigma
     if late:
-        sigma = float(np.hypot(sigma, late[imu.angle.topic].sigma * np.quantile(
-            np.abs(imu.speed), FASTEST)))
+        sigma = float(
+            np.hypot(sigma, late[imu.angle.topic].sigma * np.quantile(np.abs(imu.speed), FASTEST))
+        )
     step = find_step(imu.time, imu.values - integral, sigma, noise.quantum, REST_SPANS)
     if step:
         grave = abs(step.size) >= zero_known_to(imu.values, imu.angle.unit)
-        yield Finding('zero_shift', 'error' if grave else 'warning', imu.angle.channel,
-                      f'jumps by {step.size:.4g} rad while imu_rate shows no such motion',
-                      float(imu.time[step.sample - 1]), step.time, int(imu.sample[step.sample]),
-                      step.size, step.limit)
+        yield Finding(
+            'zero_shift',
+            'error' if grave else 'warning',
+            imu.angle.channel,
+            f'jumps by {step.size:.4g} rad while imu_rate shows no such motion',
+            float(imu.time[step.sample - 1]),
+            step.time,
+            int(imu.sample[step.sample]),
+            step.size,
+            step.limit,
+        )
 
 
 def _shift_of_rate(imu: Imu, moves: bool) -> Iterator[Finding]:
     """A zero of the rate that moves: the angle turns by a constant less from then on."""
     span = imu.steps(BIAS_WINDOW_S)
     count = len(imu.time) // span
-    means = np.array([
-        signal[: count * span].reshape(count, span).mean(axis=1)
-        for signal in (imu.time, imu.values, imu.integral, imu.speed)
-    ])
+    means = np.array(
+        [
+            signal[: count * span].reshape(count, span).mean(axis=1)
+            for signal in (imu.time, imu.values, imu.integral, imu.speed)
+        ]
+    )
     elapsed, turned, integrated, faster = np.diff(means, axis=1)
     at = span * np.arange(1, count)  # where one span ends and the next begins
     excess = (integrated - turned) / elapsed
@@ -224,7 +267,7 @@ def _shift_of_rate(imu: Imu, moves: bool) -> Iterator[Finding]:
     best = (0.0, 0.0, 0)
     for k in range(BIAS_SIDE + 2, len(at) - BIAS_SIDE + 1):
         # The span in which it moves counts for neither side, in both differences that it is in.
-        moving = np.eye(len(at))[k - 2: k]
+        moving = np.eye(len(at))[k - 2 : k]
         design = np.column_stack([*columns, *moving, np.arange(len(at)) >= k])
         inverse = np.linalg.pinv(design)
         solution = inverse @ excess
@@ -238,10 +281,17 @@ def _shift_of_rate(imu: Imu, moves: bool) -> Iterator[Finding]:
         return
     k = _bend(imu, int(at[k - 1]), span)
     grave = abs(size) > imu.rate.noise.sigma_floor
-    yield Finding('zero_shift', 'error' if grave else 'warning', imu.rate.channel,
-                  f'changes by {size:.3g} rad/s against the derivative of imu_angle, and stays '
-                  'so', float(imu.time[k]), float(imu.time[k]), int(imu.sample[k]), size,
-                  SHIFTED * abs(size) / score)
+    yield Finding(
+        'zero_shift',
+        'error' if grave else 'warning',
+        imu.rate.channel,
+        f'changes by {size:.3g} rad/s against the derivative of imu_angle, and stays so',
+        float(imu.time[k]),
+        float(imu.time[k]),
+        int(imu.sample[k]),
+        size,
+        SHIFTED * abs(size) / score,
+    )
 
 
 def _bend(imu: Imu, k: int, span: int) -> int:
@@ -258,8 +308,13 @@ def _bend(imu: Imu, k: int, span: int) -> int:
 
 
 def _stuck(
-    angle: Signal, time: np.ndarray, values: np.ndarray, integrated: np.ndarray,
-    turned: np.ndarray, span: int, noise: float,
+    angle: Signal,
+    time: np.ndarray,
+    values: np.ndarray,
+    integrated: np.ndarray,
+    turned: np.ndarray,
+    span: int,
+    noise: float,
 ) -> Iterator[Finding]:
     """An angle that stays exactly where it is while the rate says that the body turns."""
     usual = float(np.std(integrated))
@@ -270,7 +325,14 @@ def _stuck(
     still &= np.ptp(constant, axis=1) == 0.0
     hits = np.flatnonzero(still)
     if len(hits) and time[hits[-1] + span] - time[hits[0]] >= STUCK_S:
-        yield Finding('stuck', 'error', angle.channel,
-                      'does not change while imu_rate says that the body turns',
-                      float(time[hits[0]]), float(time[hits[-1] + span]),
-                      int(angle.sample[hits[0]]), float(np.abs(integrated[hits]).max()), limit)
+        yield Finding(
+            'stuck',
+            'error',
+            angle.channel,
+            'does not change while imu_rate says that the body turns',
+            float(time[hits[0]]),
+            float(time[hits[-1] + span]),
+            int(angle.sample[hits[0]]),
+            float(np.abs(integrated[hits]).max()),
+            limit,
+        )

@@ -51,6 +51,7 @@ class Motion:
     def mirrored(self, channels: tuple[str, ...], since: float = -np.inf) -> 'Motion':
         """The same with the opposite sign of some channels from an instant on."""
         sign = np.where(self.time > since, -1.0, 1.0)
+
         def turned(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             return {c: v * sign if c in channels else v for c, v in signals.items()}
 
@@ -105,7 +106,8 @@ def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
         signals: Channel -> samples.
     """
     moving = {
-        name: s for name, s in signals.items()
+        name: s
+        for name, s in signals.items()
         if name.endswith('angle') and np.std(s.values) > MOVES * max(s.noise.sigma_floor, 1e-9)
     }
     torques = {name: s for name, s in signals.items() if name.endswith('torque')}
@@ -173,9 +175,12 @@ def fit_law(
     rest = wanted - design @ (solution / size)
     freedom = max(1, len(wanted) - design.shape[1])
     errors = np.linalg.norm(rest) / np.sqrt(freedom) * np.linalg.norm(inverse, axis=1) / size
-    own, others = design[:, 0], design[:, 1 + len(extra):]
-    alone = own - others @ (np.linalg.pinv(others / size[1 + len(extra):], rcond=NEGLIGIBLE)
-                            @ own / size[1 + len(extra):])
+    own, others = design[:, 0], design[:, 1 + len(extra) :]
+    alone = own - others @ (
+        np.linalg.pinv(others / size[1 + len(extra) :], rcond=NEGLIGIBLE)
+        @ own
+        / size[1 + len(extra) :]
+    )
     k = 1 + len(extra)
     return Law(
         factor=float(solution[0] / size[0]),
@@ -183,8 +188,11 @@ def fit_law(
         extra=solution[1:k] / size[1:k],
         extra_error=errors[1:k],
         unexplained=float(rest @ rest / max(wanted @ wanted, 1e-300)),
-        share=float(abs(solution[0] / size[0]) * np.linalg.norm(alone)
-                    / max(np.linalg.norm(wanted), 1e-300)),
+        share=float(
+            abs(solution[0] / size[0])
+            * np.linalg.norm(alone)
+            / max(np.linalg.norm(wanted), 1e-300)
+        ),
         rest=rest,
         wanted=wanted,
     )

@@ -57,7 +57,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Intake:
+class Loaded:
     """What a set of bags gave.
 
     Attributes:
@@ -100,7 +100,7 @@ class Intake:
         return sum(self.origin[record.name] in self.steps for record in self.records)
 
 
-def take_in(
+def load_bags(
     bags: Sequence[str | Path],
     model_file: str | Path | None = None,
     note: Mapping[str, Any] | None = None,
@@ -108,7 +108,7 @@ def take_in(
     window: float | None = None,
     progress: Progress = lambda what, done, total: None,
     use_anyway: Iterable[str] = (),
-) -> Intake:
+) -> Loaded:
     """Read and check bags; broken ones are left out, with the reason.
 
     Args:
@@ -155,12 +155,10 @@ def take_in(
             parts = windows_of(record, found)
         pieces += parts
         origin |= {p.name: origin[cut.origin[record.name]] for p in (record, *parts)}
-    return Intake(tuple(pieces), tuple(sources), origin, cut.landings, windows, tuple(wholes))
+    return Loaded(tuple(pieces), tuple(sources), origin, cut.landings, windows, tuple(wholes))
 
 
-def _followed(
-    model: Model | None, records: Sequence[Record], window: float | None
-) -> Windows:
+def _followed(model: Model | None, records: Sequence[Record], window: float | None) -> Windows:
     if model is None or any(r.mechanism != model.mechanism.name for r in records):
         return Windows(tuple(Followed(r.name, 1.0) for r in records), window)
     return Windows(followed(model, records), window)

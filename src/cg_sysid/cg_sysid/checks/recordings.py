@@ -174,8 +174,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--json', action='store_true', help='print JSON')
     parser.add_argument('--model', help='that they will be used with: a model file or a name')
     parser.add_argument('--note', help='YAML file with the recording note, for bags without one')
-    parser.add_argument('--use-region', action='append', default=[], metavar='NAME=LOW:HIGH',
-                        help='where the model will be used; may be repeated')
+    parser.add_argument(
+        '--use-region',
+        action='append',
+        default=[],
+        metavar='NAME=LOW:HIGH',
+        help='where the model will be used; may be repeated',
+    )
     use_anyway_option(parser)
     args = parser.parse_args(argv)
     try:

@@ -30,10 +30,10 @@ def resting_band(model: Model, setup: Setup) -> dict[str, float]:
     """
     e = assemble(model, setup)
     m, size = e.coordinates, e.x.numel()
-    f = ca.Function('a', [e.x, e.u, e.p], [e.rates[m: 2 * m]])
-    stiffness = ca.Function('k', [e.x, e.u, e.p], [ca.jacobian(e.rates[m: 2 * m], e.x)[:, :m]])
+    f = ca.Function('a', [e.x, e.u, e.p], [e.rates[m : 2 * m]])
+    stiffness = ca.Function('k', [e.x, e.u, e.p], [ca.jacobian(e.rates[m : 2 * m], e.x)[:, :m]])
     u, p = np.zeros(e.u.numel()), parameter_vector(model, setup)
-    u[len(model.mechanism.inputs):] = 1.0  # a switch that is not recorded counts as on
+    u[len(model.mechanism.inputs) :] = 1.0  # a switch that is not recorded counts as on
     x = np.zeros(size)
     pull = np.asarray(stiffness(x, u, p))
     if not np.isfinite(pull).all() or np.linalg.cond(pull) > 1e8:

@@ -20,10 +20,15 @@ def check_jitter(signals: Mapping[str, Signal]) -> Iterator[Finding]:
         own = [s for s in signals.values() if s.topic == topic]
         shown = ' and '.join(found.channels)
         yield Finding(
-            'jitter', 'warning', topic, f'the instants of sampling differ from the stamps by '
+            'jitter',
+            'warning',
+            topic,
+            f'the instants of sampling differ from the stamps by '
             f'{1e3 * found.sigma:.2g} +- {1e3 * found.error:.1g} ms RMS: the noise of {shown} '
-            'grows with the rate, as no noise of a sensor does', value=found.sigma,
-            allowed=LEAST / own[0].rate)
+            'grows with the rate, as no noise of a sensor does',
+            value=found.sigma,
+            allowed=LEAST / own[0].rate,
+        )
 
 
 def timing_errors(signals: Mapping[str, Signal]) -> dict[str, TimingError]:

@@ -61,14 +61,29 @@ def check_steps(
         missing = _missing_time(step, signal, clean, raw)
         together = _others_jump(step, signal, clean)
         if _mirrored(step):
-            yield Finding('sign_error', 'error', name, f'jumps from {step.before:.4g} to '
-                          f'{step.after:.4g} {signal.unit} and goes on with the opposite sign',
-                          *place, step.after, step.before)
+            yield Finding(
+                'sign_error',
+                'error',
+                name,
+                f'jumps from {step.before:.4g} to '
+                f'{step.after:.4g} {signal.unit} and goes on with the opposite sign',
+                *place,
+                step.after,
+                step.before,
+            )
         elif missing or together:
             time = f'{1e3 * missing:.3g} ms are' if missing else 'time is'
-            yield Finding('dropped_samples', 'error', signal.topic, f'{name} jumps by '
-                          f'{step.size:.4g} {signal.unit}: {time} missing in the stamps, which '
-                          'show no gap', *place, missing or None, 0.0)
+            yield Finding(
+                'dropped_samples',
+                'error',
+                signal.topic,
+                f'{name} jumps by '
+                f'{step.size:.4g} {signal.unit}: {time} missing in the stamps, which '
+                'show no gap',
+                *place,
+                missing or None,
+                0.0,
+            )
         else:
             bands = _resting_bands(raw, model) if bands is None else bands
             yield _shift(step, signal, place, bands.get(name, 0.0), _play(raw, model))

@@ -140,8 +140,9 @@ def without_spikes(signal: Signal) -> Signal:
 def _without(signal: Signal, samples: np.ndarray) -> Signal:
     keep = np.setdiff1d(np.arange(len(signal.values)), samples)
     values = np.interp(signal.time, signal.time[keep], signal.values[keep])
-    return replace(signal, values=np.where(np.isin(np.arange(len(values)), samples), values,
-                                           signal.values))
+    return replace(
+        signal, values=np.where(np.isin(np.arange(len(values)), samples), values, signal.values)
+    )
 
 
 def _still(signals: dict[str, Signal], names: tuple[str, ...]) -> Iterator[Finding]:
@@ -166,12 +167,23 @@ def _still(signals: dict[str, Signal], names: tuple[str, ...]) -> Iterator[Findi
             if other == name or other not in signals:
                 continue
             near = (signals[other].time > start) & (signals[other].time < stop)
-            if near.sum() > 10 and np.std(signals[other].values[near]) > 0.5 * np.std(
-                signals[other].values
-            ) > 5.0 * signals[other].noise.sigma_floor:
-                yield Finding('still', 'warning', name, f'does not change for {stop - start:.2f} '
-                              f's while {other} moves as before', start, stop,
-                              int(signal.sample[first]), stop - start, STILL_S)
+            if (
+                near.sum() > 10
+                and np.std(signals[other].values[near])
+                > 0.5 * np.std(signals[other].values)
+                > 5.0 * signals[other].noise.sigma_floor
+            ):
+                yield Finding(
+                    'still',
+                    'warning',
+                    name,
+                    f'does not change for {stop - start:.2f} s while {other} moves as before',
+                    start,
+                    stop,
+                    int(signal.sample[first]),
+                    stop - start,
+                    STILL_S,
+                )
                 break
 
 
@@ -183,9 +195,17 @@ def _not_finite(raw: RawRecording) -> Iterator[Finding]:
             bad = np.flatnonzero(~topic.absent[channel] & ~np.isfinite(values))
             if len(bad):
                 time = (topic.stamp_ns[bad] - origin) / NS_PER_S
-                yield Finding('not_finite', 'error', channel,
-                              f'{len(bad)} value(s) are NaN or infinite', float(time[0]),
-                              float(time[-1]), int(bad[0]), len(bad), 0)
+                yield Finding(
+                    'not_finite',
+                    'error',
+                    channel,
+                    f'{len(bad)} value(s) are NaN or infinite',
+                    float(time[0]),
+                    float(time[-1]),
+                    int(bad[0]),
+                    len(bad),
+                    0,
+                )
 
 
 def constant_runs(values: np.ndarray, shortest: int) -> list[tuple[int, int]]:
@@ -224,11 +244,19 @@ def _clipping(signal: Signal) -> tuple[list[Finding], list[float]]:
         a, b = max(runs, key=lambda run: run[1] - run[0])
         length = sum(signal.time[last] - signal.time[first] for first, last in runs)
         limits.append(limit)
-        findings.append(Finding(
-            'sensor_clipping', 'error', signal.channel,
-            f'stays at {limit:.4g} for {length:.3f} s in all, in flat tops',
-            float(signal.time[a]), float(signal.time[b]), int(signal.sample[a]), float(length),
-            0.0))
+        findings.append(
+            Finding(
+                'sensor_clipping',
+                'error',
+                signal.channel,
+                f'stays at {limit:.4g} for {length:.3f} s in all, in flat tops',
+                float(signal.time[a]),
+                float(signal.time[b]),
+                int(signal.sample[a]),
+                float(length),
+                0.0,
+            )
+        )
     return findings, limits
 
 
@@ -259,8 +287,8 @@ def _height_over(signal: Signal, first: int, last: int, grain: float) -> float:
     at = (np.arange(n) + 1.0) * spacing
     solve = np.linalg.pinv(np.vander(at, 3, increasing=True))[1]
     up = 1.0 if values[first] == values.max() else -1.0
-    rise = -up * float(solve @ (values[first - n: first][::-1] - values[first]))
-    fall = -up * float(solve @ (values[last + 1: last + 1 + n] - values[last]))
+    rise = -up * float(solve @ (values[first - n : first][::-1] - values[first]))
+    fall = -up * float(solve @ (values[last + 1 : last + 1 + n] - values[last]))
     width = float(time[last] - time[first]) + spacing
     # A cubic with these slopes at its ends is this high in its middle.
     height = width * (rise + fall) / 8.0
@@ -289,8 +317,8 @@ def _frozen(signal: Signal, limits: list[float]) -> Iterator[Finding]:
         came, left = _comes_and_goes(signal, first, last)
         release = steps[last] if last < len(steps) else 0.0
         silent = noise.sigma > noise.quantum and (
-            _is_noisy(values[max(0, first - NOISY_SPAN): first])
-            or _is_noisy(values[last + 1: last + 1 + NOISY_SPAN])
+            _is_noisy(values[max(0, first - NOISY_SPAN) : first])
+            or _is_noisy(values[last + 1 : last + 1 + NOISY_SPAN])
         )
         halts = came and (left or last == len(values) - 1)
         if release > RELEASE * usual or silent or halts:
@@ -299,10 +327,17 @@ def _frozen(signal: Signal, limits: list[float]) -> Iterator[Finding]:
         spans = [(signal.time[a], signal.time[b]) for a, b in stuck]
         length = float(sum(b - a for a, b in spans))
         longest = max(range(len(spans)), key=lambda i: spans[i][1] - spans[i][0])
-        yield Finding('stuck', 'error', signal.channel,
-                      f'does not change for {length:.2f} s in all while it should',
-                      float(spans[longest][0]), float(spans[longest][1]),
-                      int(signal.sample[stuck[longest][0]]), length, 0.0)
+        yield Finding(
+            'stuck',
+            'error',
+            signal.channel,
+            f'does not change for {length:.2f} s in all while it should',
+            float(spans[longest][0]),
+            float(spans[longest][1]),
+            int(signal.sample[stuck[longest][0]]),
+            length,
+            0.0,
+        )
 
 
 def _comes_and_goes(signal: Signal, first: int, last: int) -> tuple[bool, bool]:
@@ -310,7 +345,7 @@ def _comes_and_goes(signal: Signal, first: int, last: int) -> tuple[bool, bool]:
     values, noise = signal.values, signal.noise
     unit = max(noise.quantum, noise.sigma, 1e-9 * float(np.ptp(values)))
     abrupt = ABRUPT * unit + ACCELERATING * _usual_bend(values)
-    before, after = values[max(0, first - 5): first + 1], values[last: last + 6]
+    before, after = values[max(0, first - 5) : first + 1], values[last : last + 6]
     return _speed(before) > abrupt, _speed(after) > abrupt
 
 
@@ -319,7 +354,7 @@ def _usual_bend(values: np.ndarray) -> float:
     stride = 5
     if len(values) <= 2 * stride:
         return 0.0
-    bend = values[2 * stride:] - 2.0 * values[stride:-stride] + values[:-2 * stride]
+    bend = values[2 * stride :] - 2.0 * values[stride:-stride] + values[: -2 * stride]
     return float(np.quantile(np.abs(bend), 0.95)) / stride**2
 
 
@@ -380,10 +415,15 @@ def _spikes(signal: Signal, spikes: np.ndarray) -> Iterator[Finding]:
     worst = int(np.argmax(np.abs(height)))
     at = float(time[spikes[worst]])
     yield Finding(
-        'spikes', 'error' if len(spikes) > MANY_SPIKES * len(values) else 'warning',
+        'spikes',
+        'error' if len(spikes) > MANY_SPIKES * len(values) else 'warning',
         signal.channel,
         f'{len(spikes)} sample(s) far from their neighbours, the worst by {height[worst]:.3g}',
-        at, at, int(signal.sample[spikes[worst]]), float(height[worst]))
+        at,
+        at,
+        int(signal.sample[spikes[worst]]),
+        float(height[worst]),
+    )
 
 
 def limit_runs(signal: Signal) -> list[tuple[int, int]]:
@@ -407,7 +447,15 @@ def _saturation(signal: Signal) -> Iterator[Finding]:
     if share < SATURATED_SHARE:
         return
     a, b = max(runs, key=lambda run: run[1] - run[0])
-    yield Finding('saturation', 'warning', signal.channel,
-                  f'the torque runs along {signal.values[a]:.4g} {signal.unit} for {share:.1%} '
-                  'of the samples', float(signal.time[a]), float(signal.time[b]),
-                  int(signal.sample[a]), share, SATURATED_SHARE)
+    yield Finding(
+        'saturation',
+        'warning',
+        signal.channel,
+        f'the torque runs along {signal.values[a]:.4g} {signal.unit} for {share:.1%} '
+        'of the samples',
+        float(signal.time[a]),
+        float(signal.time[b]),
+        int(signal.sample[a]),
+        share,
+        SATURATED_SHARE,
+    )

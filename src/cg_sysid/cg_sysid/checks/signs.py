@@ -71,7 +71,8 @@ def check_signs(
     known = sorted({channel for relation in relations for channel in relation.channels})
     sets = [
         frozenset(chosen)
-        for size in range(len(known) + 1) for chosen in combinations(known, size)
+        for size in range(len(known) + 1)
+        for chosen in combinations(known, size)
         if all(relation.satisfied(frozenset(chosen)) for relation in relations)
     ]
     if not sets:
@@ -95,8 +96,12 @@ def _relations(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Rel
     angle, rate, hip = 'imu_angle', 'imu_rate', 'hip_angle'
     agreement = agreement_of_imu(signals)
     if abs(agreement) > CORRELATED:
-        yield _pair(angle, rate, agreement > 0, 'imu_rate is the derivative of imu_angle, and '
-                    f'their correlation is {agreement:.2f}')
+        yield _pair(
+            angle,
+            rate,
+            agreement > 0,
+            f'imu_rate is the derivative of imu_angle, and their correlation is {agreement:.2f}',
+        )
     known = mechanism(raw.mechanism)
     motion = _motion(raw, signals)
     if motion is None:
@@ -105,17 +110,27 @@ def _relations(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Rel
     if raw.setup.fixture == 'outer_fixed' and {angle, hip} <= set(motion.angle):
         same = float(np.corrcoef(motion.angle[angle], motion.angle[hip])[0, 1])
         if abs(same) > ONE_ANGLE:
-            yield _pair(angle, hip, same > 0, 'imu_angle and hip_angle are one angle while the '
-                        f'outer legs are fixed, and their correlation is {same:.2f}')
+            yield _pair(
+                angle,
+                hip,
+                same > 0,
+                'imu_angle and hip_angle are one angle while the '
+                f'outer legs are fixed, and their correlation is {same:.2f}',
+            )
         joints += [(torque, angle) for torque in known.input_names]
     for torque, joint in joints:
         if joint not in motion.angle or not drives(signals, torque):
             continue
         law = fit_law(motion, torque, joint)
         if abs(law.factor) > CERTAIN * law.error and law.share > SHARE:
-            yield _pair(torque, joint, law.factor > 0, f'{torque} drives {joint} up, and '
-                        f'accelerates it by {law.factor:.3g} {signals[joint].unit}/s^2 per '
-                        f'{signals[torque].unit}')
+            yield _pair(
+                torque,
+                joint,
+                law.factor > 0,
+                f'{torque} drives {joint} up, and '
+                f'accelerates it by {law.factor:.3g} {signals[joint].unit}/s^2 per '
+                f'{signals[torque].unit}',
+            )
 
 
 def _pair(first: str, second: str, same: bool, text: str) -> Relation:
@@ -124,9 +139,9 @@ def _pair(first: str, second: str, same: bool, text: str) -> Relation:
 
 def _motion(raw: RawRecording, signals: Mapping[str, Signal]) -> Motion | None:
     known = mechanism(raw.mechanism)
-    return motion_of({
-        n: signals[n] for n in (*known.input_names, *known.output_names) if n in signals
-    })
+    return motion_of(
+        {n: signals[n] for n in (*known.input_names, *known.output_names) if n in signals}
+    )
 
 
 def _by_model(
@@ -153,8 +168,12 @@ def _by_model(
     if left[best] > BETTER * left[second] or (best and as_is < POOR):
         return
     what = f'with {best[0]} turned' if best else 'as it is'
-    yield Relation(channels, frozenset(best), f'the model leaves {left[best]:.0%} of the '
-                   f'accelerations {what}, and {left[second if not best else ()]:.0%} otherwise')
+    yield Relation(
+        channels,
+        frozenset(best),
+        f'the model leaves {left[best]:.0%} of the '
+        f'accelerations {what}, and {left[second if not best else ()]:.0%} otherwise',
+    )
 
 
 class _Equations:
@@ -167,7 +186,7 @@ class _Equations:
         self._sensors = sensor_matrix(model.mechanism, raw.setup)[:, : self._m]
         self._parameters = parameter_vector(model, raw.setup)
         self._shape = (e.x.numel(), e.u.numel())
-        self._accelerations = ca.Function('a', [e.x, e.u, e.p], [e.rates[self._m: 2 * self._m]])
+        self._accelerations = ca.Function('a', [e.x, e.u, e.p], [e.rates[self._m : 2 * self._m]])
 
     def unexplained(self, motion: Motion) -> float:
         """Share of the accelerations that the model leaves, mean over moving coordinates."""
@@ -179,7 +198,7 @@ class _Equations:
         )
         m, count = self._m, len(motion.time)
         x, u = np.zeros((self._shape[0], count)), np.ones((self._shape[1], count))
-        x[:m], x[m: 2 * m] = angle, rate
+        x[:m], x[m : 2 * m] = angle, rate
         u[: len(self._inputs)] = np.array([motion.torque[name] for name in self._inputs])
         p = np.tile(self._parameters[:, None], count)
         found = np.asarray(self._accelerations.map(count)(x, u, p))

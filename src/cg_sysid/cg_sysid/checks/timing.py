@@ -37,9 +37,14 @@ def check_timing(raw: RawRecording) -> Iterator[Finding]:
     yield from _overlap(raw, origin)
     for topic in raw.topics.values():
         if len(topic) < 2:
-            yield Finding('too_few_samples', 'error', topic.name,
-                          f'{len(topic)} sample(s); at least 2 are needed',
-                          value=len(topic), allowed=2)
+            yield Finding(
+                'too_few_samples',
+                'error',
+                topic.name,
+                f'{len(topic)} sample(s); at least 2 are needed',
+                value=len(topic),
+                allowed=2,
+            )
             continue
         yield from _order(topic, origin)
         if topic.name in (EXPERIMENT, TORQUE_COMMAND):
@@ -63,21 +68,42 @@ def _overlap(raw: RawRecording, origin: int) -> Iterator[Finding]:
     start, stop = max(s for s, _ in spans.values()), min(e for _, e in spans.values())
     if start >= stop:
         late = max(spans, key=lambda n: spans[n][0])
-        yield Finding('no_overlap', 'error', late,
-                      'the topics share no time: this one begins after another has ended',
-                      _seconds(spans[late][0], origin))
+        yield Finding(
+            'no_overlap',
+            'error',
+            late,
+            'the topics share no time: this one begins after another has ended',
+            _seconds(spans[late][0], origin),
+        )
         return
     first, last = min(s for s, _ in spans.values()), max(e for _, e in spans.values())
     for name, (begin, end) in spans.items():
         if begin - first > LATE_S * NS_PER_S:
             at = _seconds(begin, origin)
-            yield Finding('starts_late', 'warning', name, f'first sample only after {at:.2f} s',
-                          0.0, at, 0, at, LATE_S)
+            yield Finding(
+                'starts_late',
+                'warning',
+                name,
+                f'first sample only after {at:.2f} s',
+                0.0,
+                at,
+                0,
+                at,
+                LATE_S,
+            )
         if last - end > LATE_S * NS_PER_S:
             begin_s, end_s = _seconds(end, origin), _seconds(last, origin)
-            yield Finding('ends_early', 'warning', name,
-                          f'no sample in the last {end_s - begin_s:.2f} s', begin_s, end_s,
-                          len(raw.topics[name]) - 1, end_s - begin_s, LATE_S)
+            yield Finding(
+                'ends_early',
+                'warning',
+                name,
+                f'no sample in the last {end_s - begin_s:.2f} s',
+                begin_s,
+                end_s,
+                len(raw.topics[name]) - 1,
+                end_s - begin_s,
+                LATE_S,
+            )
 
 
 def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
@@ -90,11 +116,17 @@ def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
         spacing = np.diff(np.unique(stamp))
         harmless = len(spacing) > 0 and spacing.min() >= REGULAR * np.median(spacing)
         yield Finding(
-            'time_backwards', 'warning' if harmless else 'error', topic.name,
+            'time_backwards',
+            'warning' if harmless else 'error',
+            topic.name,
             f'stamps run backwards {len(backward)} time(s), first by {-step[k - 1] / 1e6:.3g} ms'
             + ('; sorting restores their order' if harmless else ''),
-            _seconds(stamp[k], origin), _seconds(stamp[k - 1], origin), k,
-            float(step[k - 1]) / NS_PER_S, 0.0)
+            _seconds(stamp[k], origin),
+            _seconds(stamp[k - 1], origin),
+            k,
+            float(step[k - 1]) / NS_PER_S,
+            0.0,
+        )
     order = np.argsort(stamp, kind='stable')
     repeats = np.flatnonzero(np.diff(stamp[order]) == 0)
     if len(repeats):
@@ -103,10 +135,16 @@ def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
             np.any(v[order][repeats] != v[order][repeats + 1]) for v in topic.values.values()
         )
         yield Finding(
-            'duplicates', 'error' if conflict else 'warning', topic.name,
+            'duplicates',
+            'error' if conflict else 'warning',
+            topic.name,
             f'{len(repeats)} stamp(s) occur twice'
             + (' with different values' if conflict else '; the copies are dropped'),
-            _seconds(stamp[k], origin), sample=k, value=len(repeats), allowed=0)
+            _seconds(stamp[k], origin),
+            sample=k,
+            value=len(repeats),
+            allowed=0,
+        )
 
 
 def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
@@ -122,30 +160,46 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     if change is not None and _change_of_rate(np.diff(stamp) / NS_PER_S) is None:
         k, before, after = change
         yield Finding(
-            'sampling_rate_change', 'error', topic.name,
+            'sampling_rate_change',
+            'error',
+            topic.name,
             f'messages arrive at {before:.4g} Hz, later at {after:.4g} Hz, but the stamps go on '
-            'as before: they are wrong', _seconds(stamp[k], origin), _seconds(stamp[-1], origin),
-            k, after, before)
+            'as before: they are wrong',
+            _seconds(stamp[k], origin),
+            _seconds(stamp[-1], origin),
+            k,
+            after,
+            before,
+        )
         return
     known = mechanism(raw.mechanism)
     ends = [
-        raw.topics[t.name].stamp_ns[-1] for t in (known.torque, *known.outputs)
+        raw.topics[t.name].stamp_ns[-1]
+        for t in (known.torque, *known.outputs)
         if t.name != topic.name and len(raw.topics.get(t.name, ()))
     ]
     holes, lost = lost_behind_stamps(topic, float(np.median(ends)) if ends else np.inf)
     if holes:
         k = holes[0]
         yield Finding(
-            'dropped_samples', 'error', topic.name, f'about {lost} sample(s) lost, the first '
+            'dropped_samples',
+            'error',
+            topic.name,
+            f'about {lost} sample(s) lost, the first '
             'here, while the stamps go on as if none were: they are wrong',
-            _seconds(stamp[k - 1], origin), _seconds(stamp[holes[-1]], origin), k, lost, 0)
+            _seconds(stamp[k - 1], origin),
+            _seconds(stamp[holes[-1]], origin),
+            k,
+            lost,
+            0,
+        )
         return
     offset = (log - stamp).astype(float) / NS_PER_S
     # Late arrivals come and go and only add to the offset; a clock that jumps moves its floor.
     windows = np.lib.stride_tricks.sliding_window_view(offset, FLOOR).min(axis=1)
     moved = windows[FLOOR:] - windows[:-FLOOR]  # sample k = index + FLOOR
     k = int(np.argmax(np.abs(moved))) + FLOOR
-    before, after = np.median(windows[:max(1, k - FLOOR)]), np.median(windows[k:])
+    before, after = np.median(windows[: max(1, k - FLOOR)]), np.median(windows[k:])
     lasting = float(after - before)
     if abs(moved[k - FLOOR]) < CLOCK_JUMP_S or abs(lasting) < 0.5 * CLOCK_JUMP_S:
         return
@@ -157,12 +211,26 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     place = (_seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), k)
     size = f'{1e3 * abs(lasting):.0f} ms'
     if in_stamp > in_log:
-        yield Finding('clock_jump', 'error', topic.name, f'the stamps jump by {size} against the '
-                      "recorder's clock", *place, lasting, CLOCK_JUMP_S)
+        yield Finding(
+            'clock_jump',
+            'error',
+            topic.name,
+            f"the stamps jump by {size} against the recorder's clock",
+            *place,
+            lasting,
+            CLOCK_JUMP_S,
+        )
     else:
-        yield Finding('clock_jump', 'warning', topic.name, f"the recorder's clock jumps by {size} "
-                      'against the stamps', *place, lasting, CLOCK_JUMP_S,
-                      'the stamps count, not the times of arrival')
+        yield Finding(
+            'clock_jump',
+            'warning',
+            topic.name,
+            f"the recorder's clock jumps by {size} against the stamps",
+            *place,
+            lasting,
+            CLOCK_JUMP_S,
+            'the stamps count, not the times of arrival',
+        )
 
 
 def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
@@ -193,12 +261,19 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
     length = spacing[worst] / NS_PER_S
     consequence = '; what happened in between is not known' if unknown else ''
     yield Finding(
-        'dropped_samples', 'error' if unknown else 'warning', topic.name,
+        'dropped_samples',
+        'error' if unknown else 'warning',
+        topic.name,
         f'{len(gaps)} gap(s), about {lost} sample(s) lost ({share:.1%}); the '
         f'{"worst" if unknown else "longest"} {1e3 * length:.1f} ms instead of '
         f'{usual[worst] / 1e6:.3g} ms' + consequence,
-        _seconds(stamp[worst], origin), _seconds(stamp[worst + 1], origin),
-        int(order[worst]), length, limit[worst] / NS_PER_S, '' if unknown else repair)
+        _seconds(stamp[worst], origin),
+        _seconds(stamp[worst + 1], origin),
+        int(order[worst]),
+        length,
+        limit[worst] / NS_PER_S,
+        '' if unknown else repair,
+    )
 
 
 def _torque_over(
@@ -236,16 +311,28 @@ def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]
     if change is not None:
         k, before, after = change
         yield Finding(
-            'sampling_rate_change', 'warning', topic.name,
+            'sampling_rate_change',
+            'warning',
+            topic.name,
             f'the rate changes midway, from {before:.4g} Hz to {after:.4g} Hz',
-            _seconds(stamp[k], origin), _seconds(stamp[-1], origin), k, after, before,
-            'samples count at their stamps, whatever their rate')
+            _seconds(stamp[k], origin),
+            _seconds(stamp[-1], origin),
+            k,
+            after,
+            before,
+            'samples count at their stamps, whatever their rate',
+        )
     if not isinstance(nominal_hz, int | float) or not nominal_hz > 0:
         return
     if abs(rate / nominal_hz - 1.0) > RATE_TOLERANCE:
-        yield Finding('rate', 'warning', topic.name,
-                      f'{rate:.4g} Hz instead of the nominal {nominal_hz:.4g} Hz',
-                      value=rate, allowed=nominal_hz)
+        yield Finding(
+            'rate',
+            'warning',
+            topic.name,
+            f'{rate:.4g} Hz instead of the nominal {nominal_hz:.4g} Hz',
+            value=rate,
+            allowed=nominal_hz,
+        )
 
 
 def _change_of_rate(spacing: np.ndarray) -> tuple[int, float, float] | None:

@@ -33,9 +33,7 @@ COMMANDS = {
     'import': Command(
         'records.importing', 'make recordings of logs from elsewhere: CSV, MAT, JSON'
     ),
-    'rehearse': Command(
-        'cli.rehearse', 'record an experiment on a simulated robot, without ROS'
-    ),
+    'rehearse': Command('cli.rehearse', 'record an experiment on a simulated robot, without ROS'),
     'check': Command(
         'checks.recordings', 'say what is wrong with recordings before anything is fitted'
     ),

@@ -125,8 +125,7 @@ def print_causes(console: Console, facts: Facts) -> None:
     """The named causes with their numbers."""
     for cause in facts['causes']:
         numbers = ', '.join(
-            f'{name} = {value_words(p)}'
-            for name, p in cause['parameters'].items()
+            f'{name} = {value_words(p)}' for name, p in cause['parameters'].items()
         )
         strength = cause['evidence_nats']
         strength = f'  (evidence {strength:.0f} nats)' if strength is not None else ''

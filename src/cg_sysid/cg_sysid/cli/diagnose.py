@@ -26,7 +26,7 @@ from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.checks.faults import FaultSignal
-from cg_sysid.checks.loading import Intake, take_in
+from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
 from cg_sysid.cluster import Cluster
 from cg_sysid.deadline import Deadline
@@ -123,11 +123,16 @@ def work(options: argparse.Namespace) -> int:
     note = cli.load_note(options.note)
     fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
     with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
-        intake = take_in(
-            options.bags, model_file, note, options.torque, options.window, bars,
+        loaded = load_bags(
+            options.bags,
+            model_file,
+            note,
+            options.torque,
+            options.window,
+            bars,
             options.use_anyway,
         )
-        _same_mechanism(model, intake.records)
+        _same_mechanism(model, loaded.records)
         origin = provenance(
             model_file,
             ['cg', 'diagnose', *_command(options)],
@@ -139,26 +144,31 @@ def work(options: argparse.Namespace) -> int:
             },
             options.date,
         )  # fmt: skip
-        if _too_few(intake):
-            facts, lines = unusable_facts(model, intake, _why(intake), origin), []
+        if _too_few(loaded):
+            facts, lines = unusable_facts(model, loaded, _why(loaded), origin), []
             answer = None
         else:
             with deadline.interruptible('cg diagnose'):
                 answer = diagnose(
-                    model, intake.records, _options(options, effects, intake, model), bars,
-                    executor, intake.landings, deadline,
+                    model,
+                    loaded.records,
+                    _options(options, effects, loaded, model),
+                    bars,
+                    executor,
+                    loaded.landings,
+                    deadline,
                 )
             lines = diagnosis_curves(answer)
-            facts = diagnosis_facts(answer, intake, origin, lines)
+            facts = diagnosis_facts(answer, loaded, origin, lines)
         options.out.mkdir(parents=True, exist_ok=True)
         bars('writing the report', 0, 1)
-        faults = [signal for source in intake.sources for signal in source.signals]
+        faults = [signal for source in loaded.sources for signal in source.signals]
         write_results(options.out, facts, lines, faults, answer)
         bars('writing the report', 1, 1)
     if answer is not None and answer.unfinished is None:
         shutil.rmtree(options.out / FITS, ignore_errors=True)
     cli.print_left_out(facts)
-    cli.print_steps(Console(), intake.steps, intake.phases)
+    cli.print_steps(Console(), loaded.steps, loaded.phases)
     cli.print_windows(Console(), facts)
     show(Console(), facts, options.out, options.quiet)
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
@@ -190,18 +200,18 @@ def _same_mechanism(model: Model, records: Sequence[Record]) -> None:
             )
 
 
-def _too_few(intake: Intake) -> bool:
+def _too_few(loaded: Loaded) -> bool:
     # One good record alone is not enough either, but then it is not the recordings' fault.
-    return not intake.records or (len(intake.records) == 1 and bool(intake.left_out))
+    return not loaded.records or (len(loaded.records) == 1 and bool(loaded.left_out))
 
 
-def _why(intake: Intake) -> str:
-    total, bad = len(intake.sources), len(intake.left_out)
+def _why(loaded: Loaded) -> str:
+    total, bad = len(loaded.sources), len(loaded.left_out)
     if bad == total:
         which = 'The recording is' if total == 1 else f'All {total} recordings are'
     else:
         which = f'{bad} of {total} recordings {"is" if bad == 1 else "are"}'
-    first = intake.left_out[0]
+    first = loaded.left_out[0]
     return f'{which} broken, and nothing was fitted. {first.name}: {first.reason}.'
 
 
@@ -222,14 +232,14 @@ def _effects(text: str | None, model: Model) -> tuple[str, ...] | None:
 
 
 def _options(
-    options: argparse.Namespace, effects: tuple[str, ...] | None, intake: Intake, model: Model
+    options: argparse.Namespace, effects: tuple[str, ...] | None, loaded: Loaded, model: Model
 ) -> Options:
     held = None
     if options.held:
-        names = [record.name for record in intake.records]
+        names = [record.name for record in loaded.records]
         held = tuple(
             n for n in names
-            if any(fnmatch.fnmatchcase(x, options.held) for x in (n, intake.origin[n]))
+            if any(fnmatch.fnmatchcase(x, options.held) for x in (n, loaded.origin[n]))
         )  # fmt: skip
         if not held or len(held) == len(names):
             raise ValueError(
@@ -239,7 +249,7 @@ def _options(
     return Options(
         effects=effects, rounds=options.rounds, workers=options.workers, held=held,
         experiments=tuple(experiments_for(model)), kept=options.out / FITS,
-        wholes=intake.wholes,
+        wholes=loaded.wholes,
     )  # fmt: skip
 
 
@@ -247,14 +257,14 @@ def diagnosis_curves(answer: Diagnosis) -> list[curves.Curve]:
     """Measured and simulated signals of every record, those held out first."""
     before, after = answer.baseline, answer.extended
     found = []
-    for role, trials, a, b in (
+    for role, data_sets, a, b in (
         ('held', answer.held, before.held, after.held),
         ('train', answer.train, before.train, after.train),
     ):
-        for k, trial in enumerate(trials):
+        for k, data_set in enumerate(data_sets):
             found.append(
                 curves.make_curve(
-                    trial, role, before.model, a.motions[k], after.model, b.motions[k]
+                    data_set, role, before.model, a.motions[k], after.model, b.motions[k]
                 )
             )
     return found

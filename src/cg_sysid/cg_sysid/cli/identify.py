@@ -17,10 +17,10 @@ from rich.table import Table
 from cg_description.paths import model_path
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.checks.loading import Intake, take_in
+from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
 from cg_sysid.errors import RecordingError
-from cg_sysid.identification.data_set import Trial, prepare
+from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.identify import Fit, fit, predict, score
 from cg_sysid.identification.nelder_mead import nelder_mead
 from cg_sysid.identification.unknowns import IdentificationError
@@ -66,17 +66,22 @@ def work(options: argparse.Namespace) -> int:
     note = cli.load_note(options.note)
     only = tuple(n.strip() for n in options.only.split(',')) if options.only else None
     with Bars('cg identify', options.quiet) as bars:
-        intake = take_in(
-            options.bags, model_file, note, options.torque, options.window, bars,
+        loaded = load_bags(
+            options.bags,
+            model_file,
+            note,
+            options.torque,
+            options.window,
+            bars,
             options.use_anyway,
         )
-        if not intake.records:
-            first = intake.left_out[0]
+        if not loaded.records:
+            first = loaded.left_out[0]
             raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
-        trials = prepare(model, intake.records)
-        found = METHODS[options.method](model, trials, only=only, progress=bars)
+        data_sets = prepare(model, loaded.records)
+        found = METHODS[options.method](model, data_sets, only=only, progress=bars)
         bars('writing the report', 0, 1)
-        before = _score(model, trials)
+        before = _score(model, data_sets)
         origin = provenance(
             model_file,
             ['cg', 'identify', *_command(options)],
@@ -87,19 +92,19 @@ def work(options: argparse.Namespace) -> int:
             },
             options.date,
         )  # fmt: skip
-        lines = _curves(model, before, found, trials)
+        lines = _curves(model, before, found, data_sets)
         facts = identification_facts(
-            model, found, before, trials, intake, options.method, origin, lines
+            model, found, before, data_sets, loaded, options.method, origin, lines
         )
         options.out.mkdir(parents=True, exist_ok=True)
         write_facts(facts, options.out)
-        faults = [signal for source in intake.sources for signal in source.signals]
+        faults = [signal for source in loaded.sources for signal in source.signals]
         curves.save(lines, options.out, faults)
-        identified_model(model, found, facts, intake).save(options.out / 'model.yaml')
+        identified_model(model, found, facts, loaded).save(options.out / 'model.yaml')
         write_report(options.out)
         bars('writing the report', 1, 1)
     cli.print_left_out(facts)
-    cli.print_steps(Console(), intake.steps, intake.phases)
+    cli.print_steps(Console(), loaded.steps, loaded.phases)
     cli.print_windows(Console(), facts)
     show(Console(), facts, options.out, options.quiet)
     return 0
@@ -117,30 +122,28 @@ def _command(options: argparse.Namespace) -> list[str]:
     return [*words, *options.bags]
 
 
-def _score(model: Model, trials: Sequence[Trial]) -> Fit | None:
+def _score(model: Model, data_sets: Sequence[DataSet]) -> Fit | None:
     """How well the model as given simulates the records; None where it runs away."""
     try:
-        found = score(model, trials)
-        for trial, motion in zip(trials, found.motions, strict=True):
-            predict(model, trial, motion)
+        found = score(model, data_sets)
+        for data_set, motion in zip(data_sets, found.motions, strict=True):
+            predict(model, data_set, motion)
     except (IdentificationError, DynamicsError):
         return None
     return found
 
 
 def _curves(
-    model: Model, before: Fit | None, found: Fit, trials: Sequence[Trial]
+    model: Model, before: Fit | None, found: Fit, data_sets: Sequence[DataSet]
 ) -> list[curves.Curve]:
     start, base = (model, before) if before else (found.model, found)
     return [
-        curves.make_curve(
-            trial, 'all', start, base.motions[k], found.model, found.motions[k]
-        )
-        for k, trial in enumerate(trials)
+        curves.make_curve(data_set, 'all', start, base.motions[k], found.model, found.motions[k])
+        for k, data_set in enumerate(data_sets)
     ]
 
 
-def identified_model(model: Model, found: Fit, facts: Facts, intake: Intake) -> Model:
+def identified_model(model: Model, found: Fit, facts: Facts, loaded: Loaded) -> Model:
     """The model with the identified values; its provenance says where it comes from."""
     origin = facts['provenance']
     return replace(
@@ -152,7 +155,7 @@ def identified_model(model: Model, found: Fit, facts: Facts, intake: Intake) -> 
             'parent': Path(origin['model_file']).name,
             'parent_sha256': origin['model_sha256'],
             'records': [
-                {'name': s.name, 'sha256': s.sha256} for s in intake.sources if not s.reason
+                {'name': s.name, 'sha256': s.sha256} for s in loaded.sources if not s.reason
             ],
             'parent_provenance': dict(model.provenance),
         },

@@ -16,7 +16,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.between_recordings import Wandering
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns
 from cg_sysid.search.candidates import Outcome, candidates_for, started_from
@@ -33,28 +33,30 @@ Run = Callable[[Callable, list[tuple], str], list]
 
 
 def what_wanders(
-    o: Outcome, trials: Sequence[Trial], names: Sequence[str] | None, run: Run
+    o: Outcome, data_sets: Sequence[DataSet], names: Sequence[str] | None, run: Run
 ) -> Wandering | None:
     """The number that explains most if every recording has its own; None if none does much.
 
     Args:
         o: The model as far as it is known, fitted.
-        trials: Those that it was fitted to, then those held out.
+        data_sets: Those that it was fitted to, then those held out.
         names: Effects that may be tried; None for the whole library.
         run: Calls a function with each tuple of arguments, in parallel perhaps, and tells people
             what for.
     """
-    recordings = list(dict.fromkeys(trial.recording for trial in trials))
+    recordings = list(dict.fromkeys(data_set.recording for data_set in data_sets))
     if not FEWEST <= len(recordings) <= MOST:
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
-    numbers = list(numbers_of(o.train.model, trials, names))
-    base = run(_fit_with_own, [(o, '', None, trials, start, np.inf)], 'all recordings as one')[0]
+    numbers = list(numbers_of(o.train.model, data_sets, names))
+    base = run(_fit_with_own, [(o, '', None, data_sets, start, np.inf)], 'all recordings as one')[
+        0
+    ]
     if isinstance(base, str) or base.normalised_error < AT_NOISE:
         return None
     # Who leaves more is neither named nor in the way of another.
     reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
-    arguments = [(o, *number, trials, start, reach) for number in numbers]
+    arguments = [(o, *number, data_sets, start, reach) for number in numbers]
     found = run(_fit_with_own, arguments, 'recording by recording')
     fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
     if not fits:
@@ -64,20 +66,22 @@ def what_wanders(
     left = min(map(_above_noise, others), default=np.inf)
     if not explained > EXPLAINS or _above_noise(best) > CLEARLY * left:
         return None
-    return _wandering(best, o.model, trials, explained)
+    return _wandering(best, o.model, data_sets, explained)
 
 
 def _above_noise(found: Fit) -> float:
     return float(found.squares - found.count.sum())
 
 
-def _wandering(found: Fit, model: Model, trials: Sequence[Trial], explained: float) -> Wandering:
+def _wandering(
+    found: Fit, model: Model, data_sets: Sequence[DataSet], explained: float
+) -> Wandering:
     known = {u.name for u in own_unknowns(model)}
     (place,) = (k for k, u in enumerate(found.own) if u.name not in known)
     number, first = found.own[place], len(found.own) - place
     values = {}
-    for trial, motion, sigmas in zip(trials, found.motions, found.own_sigmas, strict=True):
-        values[trial.recording] = float(motion[len(motion) - first]), float(sigmas[place])
+    for data_set, motion, sigmas in zip(data_sets, found.motions, found.own_sigmas, strict=True):
+        values[data_set.recording] = float(motion[len(motion) - first]), float(sigmas[place])
     called = {recording: Path(recording).name for recording in values}
     if len(set(called.values())) < len(called):
         called = {recording: recording for recording in values}
@@ -87,11 +91,11 @@ def _wandering(found: Fit, model: Model, trials: Sequence[Trial], explained: flo
 
 
 def numbers_of(
-    model: Model, trials: Sequence[Trial], names: Sequence[str] | None
+    model: Model, data_sets: Sequence[DataSet], names: Sequence[str] | None
 ) -> Iterator[tuple[str, str | None]]:
     """(Effect, place) of those that have one number, their size; of the model or not."""
     stated = [(effect.name, effect.at) for effect in model.effects]
-    lacking = candidates_for(model, [trial.setup for trial in trials], names)
+    lacking = candidates_for(model, [data_set.setup for data_set in data_sets], names)
     for name, at in (*stated, *lacking):
         if name not in LIBRARY:
             continue
@@ -103,16 +107,21 @@ def numbers_of(
 
 
 def _fit_with_own(
-    o: Outcome, name: str, at: str | None, trials: Sequence[Trial], start: Fit, reach: float
+    o: Outcome, name: str, at: str | None, data_sets: Sequence[DataSet], start: Fit, reach: float
 ) -> Fit | str:
     """A fit to all records where every recording has its own size of the effect that is named."""
     model = with_own(o.model, name, at, o.train.model) if name else o.model
     bounds = o.task.bounds
     try:
         found = fit(
-            model, trials, start=started_from(start, model, bounds), own=o.events, bounds=bounds,
-            iterations=ITERATIONS, reach=reach,
-        )  # fmt: skip
+            model,
+            data_sets,
+            start=started_from(start, model, bounds),
+            own=o.events,
+            bounds=bounds,
+            iterations=ITERATIONS,
+            reach=reach,
+        )
         return replace(found, model=o.model)  # a class made here does not leave this process
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)

@@ -31,7 +31,7 @@ from cg_sysid.diagnosis.landing_cause import with_landings
 from cg_sysid.diagnosis.late_samples import late_samples
 from cg_sysid.diagnosis.result import Cause, Diagnosis, Options, gains_of
 from cg_sysid.diagnosis.summary import summary_of
-from cg_sysid.identification.data_set import Trial, prepare
+from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.kept_fits import keeping, kept_in
@@ -56,17 +56,17 @@ from cg_sysid.search.candidates import (
     fit_to_all,
     one_minimum,
     parameters_of,
+    prior_conflicts,
     shared_parameters,
     started_from,
-    strained,
 )
 from cg_sysid.search.model_selection import (
     ACCOUNTS,
     COARSE_FIDELITY,
     EARNED,
     MATERIAL,
-    Contest,
-    Jury,
+    Comparison,
+    ModelSelection,
     above_noise,
     at_noise,
     explained_by,
@@ -76,12 +76,12 @@ from cg_sysid.search.model_selection import (
 from cg_sysid.search.nuisance import (
     as_sound_robots,
     faults_among,
-    imperfect,
-    with_imperfections,
+    nuisances,
+    with_nuisances,
 )
 from cg_sysid.search.ranking import Candidate, Round, contains, effect_name, per_output
 from cg_sysid.search.standings import SoFar, Unfinished, title_of
-from cg_sysid.search.successive_halving import RUNGS, Effects, Race
+from cg_sysid.search.successive_halving import RUNGS, Effects, SuccessiveHalving
 from cg_sysid.stances.held_foot import held_by_friction
 from cg_sysid.stances.phases import Landing, cut_steps
 from cg_sysid.text import measured
@@ -105,37 +105,37 @@ Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of
 
 
 def split(
-    trials: Sequence[Trial], chosen: Sequence[str] | None = None
-) -> tuple[list[Trial], list[Trial]]:
-    """Training and held-out trials: within each set-up, every second recording is held out.
+    data_sets: Sequence[DataSet], chosen: Sequence[str] | None = None
+) -> tuple[list[DataSet], list[DataSet]]:
+    """Training and held-out data sets: within each set-up, every second recording is held out.
 
     Pieces of one recording share its mishaps and resting places and are poor judges of each
     other: they are split only where a set-up was recorded once.
 
     Args:
-        trials: All of them.
+        data_sets: All of them.
         chosen: Names of those to hold out instead.
 
     Raises:
         IdentificationError: if there are fewer than two, or none is left on one side.
     """
-    if len(trials) < 2:
+    if len(data_sets) < 2:
         raise IdentificationError(
-            f'{len(trials)} record: a diagnosis needs at least two, one to fit and one to judge; '
-            'record another, or cut a long one into windows (--window SECONDS)'
+            f'{len(data_sets)} record: a diagnosis needs at least two, one to fit and one to '
+            'judge; record another, or cut a long one into windows (--window SECONDS)'
         )
     if chosen is not None:
-        held = [trial for trial in trials if trial.name in chosen]
-        train = [trial for trial in trials if trial.name not in chosen]
+        held = [data_set for data_set in data_sets if data_set.name in chosen]
+        train = [data_set for data_set in data_sets if data_set.name not in chosen]
         if not held or not train:
             raise IdentificationError(
-                f'{len(held)} of {len(trials)} records held out; at least one is needed to fit '
+                f'{len(held)} of {len(data_sets)} records held out; at least one is needed to fit '
                 'and one to judge'
             )
         return train, held
-    groups: dict[str, list[Trial]] = {}
-    for trial in trials:
-        groups.setdefault(repr(trial.setup), []).append(trial)
+    groups: dict[str, list[DataSet]] = {}
+    for data_set in data_sets:
+        groups.setdefault(repr(data_set.setup), []).append(data_set)
     train, held = [], []
     single = 0
     for group in groups.values():
@@ -144,10 +144,10 @@ def split(
             (train if single % 2 == 0 else held).append(group[0])
             single += 1
             continue
-        recordings = list(dict.fromkeys(trial.recording for trial in group))
+        recordings = list(dict.fromkeys(data_set.recording for data_set in group))
         if len(recordings) > 1:
-            train += [trial for trial in group if trial.recording in recordings[0::2]]
-            held += [trial for trial in group if trial.recording in recordings[1::2]]
+            train += [data_set for data_set in group if data_set.recording in recordings[0::2]]
+            held += [data_set for data_set in group if data_set.recording in recordings[1::2]]
         else:
             train += group[0::2]
             held += group[1::2]
@@ -186,12 +186,12 @@ def diagnose(
     if landings is None:
         cut = cut_steps(records, model)
         records, landings = cut.records, cut.landings
-    prepared = [led_in(trial) for trial in prepare(model, [*records, *options.wholes])]
-    trials = prepared[: len(records)]
-    train, held = split(trials, options.held)
+    prepared = [led_in(data_set) for data_set in prepare(model, [*records, *options.wholes])]
+    data_sets = prepared[: len(records)]
+    train, held = split(data_sets, options.held)
     held = judging_whole(held, train, prepared[len(records) :])
 
-    def answer(train: Sequence[Trial], held: Sequence[Trial]) -> Diagnosis:
+    def answer(train: Sequence[DataSet], held: Sequence[DataSet]) -> Diagnosis:
         search = _Search(model, train, held, options, progress, executor, deadline)
         found = search.run()
         try:
@@ -234,27 +234,27 @@ def broken_off(found: Diagnosis, deadline: Deadline, step: str) -> Diagnosis:
 
 
 def judging_whole(
-    held: Sequence[Trial], train: Sequence[Trial], wholes: Sequence[Trial]
-) -> list[Trial]:
-    """Held-out trials, whole recordings in place of their windows.
+    held: Sequence[DataSet], train: Sequence[DataSet], wholes: Sequence[DataSet]
+) -> list[DataSet]:
+    """Held-out data sets, whole recordings in place of their windows.
 
     Windows forgive a model that goes astray slowly: each begins anew. So a recording that can be
     followed whole judges whole, unless some of its windows are fitted.
     """
-    fitted = {trial.recording for trial in train}
+    fitted = {data_set.recording for data_set in train}
     judging = {w.recording: w for w in wholes if w.recording not in fitted}
-    replaced = [judging.get(trial.recording, trial) for trial in held]
-    return list({trial.name: trial for trial in replaced}.values())
+    replaced = [judging.get(data_set.recording, data_set) for data_set in held]
+    return list({data_set.name: data_set for data_set in replaced}.values())
 
 
-def led_in(trial: Trial) -> Trial:
-    """The trial less the outputs of its first moments.
+def led_in(data_set: DataSet) -> DataSet:
+    """The data set less the outputs of its first moments.
 
     What went before a record is an assumption of every model with a memory, as a delay; it must
     not count for or against the model.
     """
-    begun = trial.time >= min(LEAD_IN_S, LEAD_IN_SHARE * trial.duration)
-    return replace(trial, outputs=np.where(begun[:, None], trial.outputs, np.nan))
+    begun = data_set.time >= min(LEAD_IN_S, LEAD_IN_SHARE * data_set.duration)
+    return replace(data_set, outputs=np.where(begun[:, None], data_set.outputs, np.nan))
 
 
 def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> str:
@@ -279,11 +279,11 @@ class _Search:
         self.deadline = deadline
         self.nominal, self.options, self.progress = model, options, progress
         self.train, self.held, self.executor = train, held, executor
-        self.jury = Jury(train, held)
-        self.race = Race(train, held, self.carry_out)
+        self.selection = ModelSelection(train, held)
+        self.halving = SuccessiveHalving(train, held, self.carry_out)
         self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         # By the labels of what was added, and whether small faults are allowed for.
-        self.contests: dict[tuple[frozenset[str], bool], Contest] = {}
+        self.comparisons: dict[tuple[frozenset[str], bool], Comparison] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | str] = {}  # to all records
         # For an answer before the end: what stands, and the base of the contest under way.
@@ -294,7 +294,7 @@ class _Search:
         self.doubted: dict[str, Outcome] = {}  # cause -> small faults that explain as much
 
     def run(self) -> Diagnosis:
-        base = self.race.fit([Task(self.nominal)], 'fitting the nominal model')[0]
+        base = self.halving.fit([Task(self.nominal)], 'fitting the nominal model')[0]
         if isinstance(base, str):
             raise IdentificationError(base)
         self.found = self.under_way = base
@@ -319,7 +319,7 @@ class _Search:
 
     def _added(self, o: Outcome) -> frozenset[str]:
         """Labels of the effects that were put on top of the nominal model, less small faults."""
-        return self._added_to(o.model) - imperfect(o.model, o.task.bounds)
+        return self._added_to(o.model) - nuisances(o.model, o.task.bounds)
 
     def _added_to(self, model: Model) -> frozenset[str]:
         stated = {effect.label for effect in self.nominal.effects}
@@ -332,9 +332,9 @@ class _Search:
             plain, o = o, self._with_small_faults(o)
             winner = None
             if not self._done(o):
-                contest = self._of_size(self._contest(o))
-                o, winner = contest.base, contest.winner()
-                self._note(contest, winner[0].label if winner else '')
+                comparison = self._of_size(self._compare(o))
+                o, winner = comparison.base, comparison.winner()
+                self._note(comparison, winner[0].label if winner else '')
             if winner is not None:
                 self.found = winner[1]
                 o = self.found = self._refitted(winner[1])
@@ -357,7 +357,7 @@ class _Search:
         if settled(o):
             return o
         task = Task(o.model, events=o.events, bounds=o.task.bounds)
-        again = self.race.fit([task], f'{o.label} again')
+        again = self.halving.fit([task], f'{o.label} again')
         better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
         return replace(better[0], label=o.label) if better else o
 
@@ -374,9 +374,13 @@ class _Search:
     def _fitted_thoroughly(self, o: Outcome) -> Outcome:
         task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                     iterations=THOROUGH_ITERATIONS)  # fmt: skip
-        tasks = [replace(task, leads=(start.train,)) for start in (o, *self._other_minima(o))]
+        tasks = [
+            replace(task, warm_starts=(start.train,)) for start in (o, *self._other_minima(o))
+        ]
         title = f'thorough fits of {self._title(self._added(o))}'
-        found = [fitted for fitted in self.race.fit(tasks, title) if isinstance(fitted, Outcome)]
+        found = [
+            fitted for fitted in self.halving.fit(tasks, title) if isinstance(fitted, Outcome)
+        ]
         return min([o, *found], key=chi2)
 
     def _other_minima(self, o: Outcome) -> list[Outcome]:
@@ -392,11 +396,12 @@ class _Search:
         title = f'other starts of {self._title(self._added(o))}'
         near = SAME * o.train.normalised_error
         tasks = [
-            replace(look.task, leads=(lead,), iterations=RUNGS[0], reach=near)
-            for look in self.race.look_beside(without, title) for lead in look.task.leads
-            if lead.normalised_error < FROM_AFAR * look.error
-        ]  # fmt: skip
-        found = self.race.fit(tasks, title)
+            replace(screening.task, warm_starts=(warm_start,), iterations=RUNGS[0], reach=near)
+            for screening in self.halving.screen_beside(without, title)
+            for warm_start in screening.task.warm_starts
+            if warm_start.normalised_error < FROM_AFAR * screening.error
+        ]
+        found = self.halving.fit(tasks, title)
         return [
             other for other in found
             if isinstance(other, Outcome) and other.train.normalised_error < near
@@ -404,18 +409,20 @@ class _Search:
             and not _further_up(other.train, o.train)
         ]  # fmt: skip
 
-    def _tie(self, contest: Contest, label: str) -> Contest | None:
+    def _tie(self, comparison: Comparison, label: str) -> Comparison | None:
         """An effect and its rivals, fitted thoroughly: what is a tie then is one.
 
         One that has the effect within it fits as well by itself, and is no rival.
         """
-        rivals = (c.label for c in contest.close_to(label, COARSE_FIDELITY))
+        rivals = (c.label for c in comparison.close_to(label, COARSE_FIDELITY))
         close = [label, *(rival for rival in rivals if not contains(rival, label))]
-        ties = [pair[1] for name in close if (pair := contest.of(name)) and at_noise(pair[1])]
+        ties = [pair[1] for name in close if (pair := comparison.of(name)) and at_noise(pair[1])]
         if len(ties) < 2 or ties[0].label != label:
             return None
         outcomes = [self._thorough(o) for o in ties]
-        return self.jury.contest(contest.base, outcomes, [self._fit_to_all(o) for o in outcomes])
+        return self.selection.comparison(
+            comparison.base, outcomes, [self._fit_to_all(o) for o in outcomes]
+        )
 
     def _fit_to_all(self, o: Outcome) -> Fit | str:
         """A thorough fit of an outcome's structure to all records, or why there is none."""
@@ -432,13 +439,14 @@ class _Search:
         Of several that do as well, the one that needs the fewest small faults beside it.
         """
         for label in sorted(self._added(final)):
-            contest = self._without(nominal, final, label)
-            tie = contest and self._tie(contest, label)
+            comparison = self._without(nominal, final, label)
+            tie = comparison and self._tie(comparison, label)
             own, winner = (tie.of(label), tie.winner()) if tie else (None, None)
             if not (tie and own and winner):
                 continue
             level = [
-                o for c, o in tie.ranked
+                o
+                for c, o in tie.ranked
                 if not c.reason and c.evidence > winner[0].evidence - tie.margin
             ]
             best = min(level, key=lambda o: len(_shown(o)))
@@ -451,9 +459,9 @@ class _Search:
         """The same with what every robot has a little of, if that explains anything."""
         if settled(o) or o.task.bounds:
             return o
-        model, bounds = with_imperfections(o.model, self._setups())
+        model, bounds = with_nuisances(o.model, self._setups())
         title = f'{self._title(self._added(o))}, with small faults'
-        found = self.race.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
+        found = self.halving.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
         if isinstance(found, str):
             log.info('small faults: %s', found)
             return o
@@ -469,15 +477,15 @@ class _Search:
         """
         if faulty is plain or settled(plain):
             return None
-        contest = self._contest(plain, faulty.train.normalised_error)
-        plain, winner = contest.base, contest.winner()
+        comparison = self._compare(plain, faulty.train.normalised_error)
+        plain, winner = comparison.base, comparison.winner()
         if winner is None:
             return plain if settled(plain) else None
-        least = winner[0].evidence - contest.margin
+        least = winner[0].evidence - comparison.margin
         if any(as_sound_robots(c.label, c.parameters)
-               for c, _ in contest.ranked if c.evidence > least):  # fmt: skip
+               for c, _ in comparison.ranked if c.evidence > least):  # fmt: skip
             return None  # it may be no more than that
-        both = self.jury.contest(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
+        both = self.selection.comparison(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
         (first, _), (second, _) = both.ranked
         label = winner[0].label
         if first.evidence < second.evidence + both.margin:
@@ -488,30 +496,30 @@ class _Search:
             self.doubted[label] = replace(faulty, label=SMALL_FAULTS)
         elif first.label == SMALL_FAULTS:
             return None
-        self._note(contest, label)
+        self._note(comparison, label)
         return self._refitted(winner[1])
 
-    def _of_size(self, contest: Contest) -> Contest:
+    def _of_size(self, comparison: Comparison) -> Comparison:
         """Without winners that hide behind small faults, but are small themselves.
 
         What a cause explains is asked beside those small faults only that it does not make idle.
         """
-        while self.jury.imitated(contest.base) and (winner := contest.winner()):
+        while self.selection.imitated(comparison.base) and (winner := comparison.winner()):
             label = winner[0].label
             lean = self._less_small_faults(winner[1])
             without = self._without_small_faults(lean, [label])
             explained = explained_by(without, lean) if without else 0.0
             if explained >= MATERIAL:
                 break
-            contest = contest.less(
+            comparison = comparison.less(
                 label, f'explains {explained:.2f} noise standard deviations where no small fault '
                 f'does, {MATERIAL:g} needed'
             )  # fmt: skip
-        return contest
+        return comparison
 
     def _less_small_faults(self, final: Outcome) -> Outcome:
         """Without those small faults that, beside the causes, explain nothing any more."""
-        small = imperfect(final.model, final.task.bounds)
+        small = nuisances(final.model, final.task.bounds)
         idle = [label for label in sorted(small) if not _shows(final, label)]
         for gone in (sorted(small), idle):
             if not gone:
@@ -519,14 +527,14 @@ class _Search:
             lean = self._without_small_faults(final, gone)
             if lean is None:
                 continue
-            if self.jury.contest(lean, [final]).ranked[0][0].evidence < EARNED:
+            if self.selection.comparison(lean, [final]).ranked[0][0].evidence < EARNED:
                 return lean
         return final
 
     def _bare(self, o: Outcome) -> Outcome | None:
         """The same without anything small that the nominal model does not state."""
         bare = replace(o, task=replace(o.task, bounds=faults_among(o.model, o.task.bounds)))
-        return self._without_small_faults(bare, sorted(imperfect(o.model, o.task.bounds)))
+        return self._without_small_faults(bare, sorted(nuisances(o.model, o.task.bounds)))
 
     def _without_small_faults(self, o: Outcome, gone: Sequence[str]) -> Outcome | None:
         """The same without the small faults of these labels; None where that cannot be fitted."""
@@ -535,12 +543,12 @@ class _Search:
             model = model.without_effect(label)
             bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
         start = started_from(o.train, model, bounds)
-        task = Task(model, events=o.events, bounds=bounds, leads=(start,))
-        lean = self.race.fit([task], 'without small faults')[0]
+        task = Task(model, events=o.events, bounds=bounds, warm_starts=(start,))
+        lean = self.halving.fit([task], 'without small faults')[0]
         return None if isinstance(lean, str) else lean
 
     def _setups(self) -> list[Setup]:
-        return [trial.setup for trial in (*self.train, *self.held)]
+        return [data_set.setup for data_set in (*self.train, *self.held)]
 
     def _exchange(self, nominal: Outcome, final: Outcome) -> Outcome | None:
         """A better structure: without an effect that is not earned, or with another instead.
@@ -548,89 +556,97 @@ class _Search:
         Beside the others an effect may turn out to have stood in for what came later.
         """
         for label in sorted(self._added(final)):
-            contest = self._without(nominal, final, label)
-            if contest is None:
+            comparison = self._without(nominal, final, label)
+            if comparison is None:
                 continue
-            own = contest.of(label)
-            winner = contest.winner()
+            own = comparison.of(label)
+            winner = comparison.winner()
             if winner is None or own is None:
-                return contest.base
+                return comparison.base
             rival, outcome = winner
-            better = rival.evidence > own[0].evidence + contest.margin
+            better = rival.evidence > own[0].evidence + comparison.margin
             simpler = contains(label, rival.label)
             if rival.label != label and (own[0].reason or better or simpler):
                 return outcome
         return None
 
-    def _without(self, nominal: Outcome, final: Outcome, label: str) -> Contest | None:
+    def _without(self, nominal: Outcome, final: Outcome, label: str) -> Comparison | None:
         """The library in competition for the place of one of several effects."""
         others = self._added(final) - {label}
         key = others, bool(final.task.bounds)
-        if key not in self.contests:
+        if key not in self.comparisons:
             model, bounds = final.model.without_effect(label), final.task.bounds
             if bounds:
-                model, missing = with_imperfections(model, self._setups())
+                model, missing = with_nuisances(model, self._setups())
                 bounds = {**bounds, **missing}
             task = Task(model, events=final.events, bounds=bounds)
             known = not others and not bounds
-            lean = nominal if known else self.race.fit([task], f'model without {label}')[0]
+            lean = nominal if known else self.halving.fit([task], f'model without {label}')[0]
             if isinstance(lean, str):
                 log.info('without %s: %s', label, lean)
                 return None
             # Who would take the place has to come up to what is there.
-            self._contest(lean, final.train.normalised_error)
-        contest = self.contests[key]
+            self._compare(lean, final.train.normalised_error)
+        comparison = self.comparisons[key]
         # The fit beside the others may have been better, or the only one that went through.
-        ranked = contest.of(label)
+        ranked = comparison.of(label)
         if ranked is None or chi2(final) < chi2(ranked[1]):
-            outcomes = [o for _, o in contest.ranked if o.label != label]
-            again = self.jury.contest(contest.base, [*outcomes, replace(final, label=label)])
-            contest = self.contests[key] = replace(again, aside=contest.aside)
-        return contest
+            outcomes = [o for _, o in comparison.ranked if o.label != label]
+            again = self.selection.comparison(
+                comparison.base, [*outcomes, replace(final, label=label)]
+            )
+            comparison = self.comparisons[key] = replace(again, aside=comparison.aside)
+        return comparison
 
-    def _contest(self, base: Outcome, beaten: float = np.inf) -> Contest:
+    def _compare(self, base: Outcome, beaten: float = np.inf) -> Comparison:
         """The library in competition on top of a base, and with what came to chi2/N `beaten`."""
         added = self._added(base)
         key = added, bool(base.task.bounds)
-        if key not in self.contests:
-            recorded = {name for trial in self.train for name in trial.input_names}
+        if key not in self.comparisons:
+            recorded = {name for data_set in self.train for name in data_set.input_names}
             bounds = base.task.bounds
             effects = candidates_for(
                 base.model, self._setups(), self.options.effects, recorded,
-                imperfect(base.model, bounds),
+                nuisances(base.model, bounds),
             )  # fmt: skip
             title = f'effects on top of {self._title(added)}'
             self.under_way = base
             base, alone = self._led_deeper(base, effects, title)
             self.under_way = base
-            outcomes, aside = ([], []) if self._done(base) else self.race.run(
-                alone, effects, title, beaten, self.jury.to_be_earned(base)
+            outcomes, aside = (
+                ([], [])
+                if self._done(base)
+                else self.halving.run(
+                    alone, effects, title, beaten, self.selection.to_be_earned(base)
+                )
             )
-            contest = self.jury.contest(base, outcomes)
-            self.contests[key] = replace(contest, aside=tuple(aside))
-        return self.contests[key]
+            comparison = self.selection.comparison(base, outcomes)
+            self.comparisons[key] = replace(comparison, aside=tuple(aside))
+        return self.comparisons[key]
 
-    def _led_deeper(
-        self, base: Outcome, effects: Effects, title: str
-    ) -> tuple[Outcome, Task]:
+    def _led_deeper(self, base: Outcome, effects: Effects, title: str) -> tuple[Outcome, Task]:
         """A base, or the deeper minimum of it that effects on top of it showed; and its task."""
         alone = self._alone(base)
         for _ in range(DEEPER):
-            lead = None if self._done(base) else self.race.lead_deeper(alone, effects, title)
-            if lead is None:
+            warm_start = (
+                None if self._done(base) else self.halving.lead_deeper(alone, effects, title)
+            )
+            if warm_start is None:
                 break
-            task = replace(alone, leads=(lead,), base=None)
-            deeper = self.race.fit([task], f'{self._title(self._added(base))}, deeper')[0]
+            task = replace(alone, warm_starts=(warm_start,), base=None)
+            deeper = self.halving.fit([task], f'{self._title(self._added(base))}, deeper')[0]
             if isinstance(deeper, str) or SAME * chi2(deeper) > chi2(base):
                 break
-            self.race.forget(alone)
+            self.halving.forget(alone)
             base = replace(deeper, label=base.label)
             alone = self._alone(base)
         return base, alone
 
     def _done(self, o: Outcome) -> bool:
         """Whether there is nothing to look for on top of this."""
-        return (settled(o) and not self.jury.imitated(o)) or self.jury.nothing_material(o)
+        return (settled(o) and not self.selection.imitated(o)) or self.selection.nothing_material(
+            o
+        )
 
     def _alone(self, base: Outcome) -> Task:
         """The task of a base by itself, with its fits."""
@@ -654,35 +670,35 @@ class _Search:
     def _title(self, added: frozenset[str]) -> str:
         return title_of(added)
 
-    def _note(self, contest: Contest, accepted: str) -> None:
-        candidates = tuple(c for c, _ in contest.ranked)
-        title = self._title(self._added(contest.base))
+    def _note(self, comparison: Comparison, accepted: str) -> None:
+        candidates = tuple(c for c, _ in comparison.ranked)
+        title = self._title(self._added(comparison.base))
         self.rounds.append(
-            Round(title, candidates, accepted, contest.independent, contest.aside)
+            Round(title, candidates, accepted, comparison.independent, comparison.aside)
         )
 
     def _causes(self, nominal: Outcome, final: Outcome) -> list[Cause]:
         causes = []
         for label in self._added(final):
-            contest = self._without(nominal, final, label)
-            if contest is None:
+            comparison = self._without(nominal, final, label)
+            if comparison is None:
                 causes.append(Cause(label, parameters_of(final, label), float('inf')))
                 continue
             if len(self._added(final)) > 1:
-                self._note(contest, label)
-            cause = _cause(final, label, self._tie(contest, label) or contest)
+                self._note(comparison, label)
+            cause = _cause(final, label, self._tie(comparison, label) or comparison)
             if label in self.doubted:
                 cause = replace(cause, rivals=(*cause.rivals, *_shown(self.doubted[label])))
-            causes.append(replace(cause, proposals=self._proposals(final, cause, contest)))
+            causes.append(replace(cause, proposals=self._proposals(final, cause, comparison)))
         return sorted(causes, key=lambda cause: -cause.evidence)
 
     def _proposals(
-        self, final: Outcome, cause: Cause, contest: Contest
+        self, final: Outcome, cause: Cause, comparison: Comparison
     ) -> tuple[Proposal, ...]:
         """Experiments that would tell a cause from its rivals."""
         if not cause.rivals or not self.options.experiments:
             return ()
-        found = (contest.of(label) for label in cause.rivals)
+        found = (comparison.of(label) for label in cause.rivals)
         rivals = [replace(final, label=cause.label), *(pair[1] for pair in found if pair)]
         if cause.label in self.doubted:
             rivals.append(self.doubted[cause.label])
@@ -707,8 +723,8 @@ class _Search:
 
     def _own_judges(self) -> list[str]:
         """That recordings were judged by pieces of themselves, in words."""
-        fitted = {trial.recording for trial in self.train}
-        judges = {trial.recording for trial in self.held}
+        fitted = {data_set.recording for data_set in self.train}
+        judges = {data_set.recording for data_set in self.held}
         if judges - fitted:
             return []
         return [
@@ -719,7 +735,7 @@ class _Search:
     def _small_faults(self, final: Outcome) -> list[str]:
         """What is there of small faults and what else would explain them, in words."""
         found = _small_faults(final)
-        if self.jury.imitated(final):
+        if self.selection.imitated(final):
             found.append(
                 f'what these leave is {1 + above_noise(final):.3f} times the noise and follows '
                 'something: a small cause may hide behind them'
@@ -728,9 +744,7 @@ class _Search:
 
     def _wandering(self, o: Outcome) -> Wandering | None:
         """The number that differs from recording to recording, if one explains what is left."""
-        return what_wanders(
-            o, (*self.train, *self.held), self.options.effects, self.carry_out
-        )
+        return what_wanders(o, (*self.train, *self.held), self.options.effects, self.carry_out)
 
     def _late_samples(self, gains: Sequence[Gain]) -> str:
         """That instants of sampling are not where their stamps say, in words."""
@@ -748,11 +762,11 @@ class _Search:
         for label in sorted(self._added(final)):
             if all(p.each != 'record' for p in final.model.effect(label).parameters):
                 continue
-            contest = self._without(nominal, final, label) if self._left(final) else None
-            wandering = self._wandering(contest.base) if contest else None
-            if contest and wandering:
-                unexplained = (1 - wandering.explained) * above_noise(contest.base)
-                final = contest.base if unexplained < above_noise(final) else final
+            comparison = self._without(nominal, final, label) if self._left(final) else None
+            wandering = self._wandering(comparison.base) if comparison else None
+            if comparison and wandering:
+                unexplained = (1 - wandering.explained) * above_noise(comparison.base)
+                final = comparison.base if unexplained < above_noise(final) else final
         return final
 
     def _conclude(self, nominal: Outcome, final: Outcome) -> Diagnosis:
@@ -798,19 +812,19 @@ class _Search:
                 model = nominal.task.model.with_effect(name, at, **values)
                 known = replace(term.fit, motions=nominal.train.motions, own=nominal.train.own)
                 start = started_from(known, model, nominal.task.bounds)
-                tasks.append(Task(model, bounds=nominal.task.bounds, leads=(start,)))
-        found = self.race.fit(tasks, f'{term.label}, as effects of the library')
+                tasks.append(Task(model, bounds=nominal.task.bounds, warm_starts=(start,)))
+        found = self.halving.fit(tasks, f'{term.label}, as effects of the library')
         outcomes = [
             replace(o, label=o.model.effects[-1].label) for o in found if isinstance(o, Outcome)
         ]
         if not outcomes:
             return None
-        contest = self.jury.contest(nominal, [min(outcomes, key=chi2)])
-        winner = contest.winner()
+        comparison = self.selection.comparison(nominal, [min(outcomes, key=chi2)])
+        winner = comparison.winner()
         if winner is None or share_explained(nominal.held, winner[1].held) < NEARLY_ALL:
             return None
-        self.contests[frozenset(), bool(nominal.task.bounds)] = contest
-        self._note(contest, winner[0].label)
+        self.comparisons[frozenset(), bool(nominal.task.bounds)] = comparison
+        self._note(comparison, winner[0].label)
         return winner[1]
 
     def _with_events(self, final: Outcome, cause: Cause) -> Cause:
@@ -828,24 +842,25 @@ class _Search:
         if isinstance(found, str):
             log.info('%s on all records: %s', cause.label, found)
             return cause
-        names = [name for side in final.trials for name in side]
+        names = [name for side in final.data_sets for name in side]
         return replace(
-            cause, events=events_in(found, names, cause.label),
+            cause,
+            events=events_in(found, names, cause.label),
             parameters=cause.parameters | shared_parameters(found, cause.label),
             undetermined=_undetermined(found, cause.label),
         )
 
     def _broken_off(self, nominal: Outcome) -> Diagnosis:
         """The best answer before the end, without any fit more."""
-        final, contest = self.found, None
+        final, comparison = self.found, None
         if self._added(self.under_way) >= self._added(final):
             final = self.under_way
-            contest = self.jury.contest(final, self.so_far.fitted(final.task))
-            winner = None if self._done(final) else contest.winner()
-            self._note(contest, winner[0].label if winner else '')
+            comparison = self.selection.comparison(final, self.so_far.fitted(final.task))
+            winner = None if self._done(final) else comparison.winner()
+            self._note(comparison, winner[0].label if winner else '')
             final = winner[1] if winner else final
-        contests = [*self.contests.values(), *([contest] if contest else [])]
-        causes = [_cause_among(final, label, contests) for label in sorted(self._added(final))]
+        comparisons = [*self.comparisons.values(), *([comparison] if comparison else [])]
+        causes = [_cause_among(final, label, comparisons) for label in sorted(self._added(final))]
         left = bool(self._left(final))
         verdict = verdict_of(causes, left, share_explained(nominal.held, final.held))
         verdict = 'unfinished' if verdict == 'unexplained' else verdict
@@ -858,10 +873,10 @@ class _Search:
         """What was not come to."""
         base = self.under_way.task
         fitted = {o.label for o in self.so_far.fitted(base)}
-        looked = {look.label for look in self.so_far.looked_at(base)} - fitted
-        recorded = {name for trial in self.train for name in trial.input_names}
+        looked = {screening.label for screening in self.so_far.screened(base)} - fitted
+        recorded = {name for data_set in self.train for name in data_set.input_names}
         possible = candidates_for(base.model, self._setups(), self.options.effects, recorded,
-                                  imperfect(base.model, base.bounds))  # fmt: skip
+                                  nuisances(base.model, base.bounds))  # fmt: skip
         labels = {LIBRARY[name](base.model.mechanism, at).label for name, at in possible}
         ruled_out = {label for r in self.rounds for label in r.aside}
         ranking = [s for s in self.so_far.ranking(base) if s.label not in self._added(final)]
@@ -896,10 +911,10 @@ class _Search:
         unfinished: Unfinished | None = None,
     ) -> Diagnosis:
         gains = self._gains(nominal, final)
-        reference = self.jury.judge(nominal, nominal, 0.0)
-        extended = self.jury.judge(nominal, final, sum(c.evidence for c in causes))
+        reference = self.selection.judge(nominal, nominal, 0.0)
+        extended = self.selection.judge(nominal, final, sum(c.evidence for c in causes))
         summary = summary_of(
-            verdict, causes, gains, self._left(final), tuple(strained(nominal)), unmodelled,
+            verdict, causes, gains, self._left(final), tuple(prior_conflicts(nominal)), unmodelled,
             self.options.effects, wandering, share_explained(nominal.held, final.held), late,
         )  # fmt: skip
         measured_start = self._from_measured_angles(nominal, final) if causes else None
@@ -943,7 +958,7 @@ def _structure(o: Outcome) -> Structure:
 
 def _shown(o: Outcome) -> tuple[str, ...]:
     """Small faults that are there."""
-    small = sorted(imperfect(o.model, o.task.bounds))
+    small = sorted(nuisances(o.model, o.task.bounds))
     return tuple(label for label in small if _shows(o, label))
 
 
@@ -956,7 +971,7 @@ def _shows(o: Outcome, label: str) -> bool:
 def _small_faults(o: Outcome) -> list[str]:
     """What is there of small faults, in words."""
     found = []
-    for label in sorted(imperfect(o.model, o.task.bounds)):
+    for label in sorted(nuisances(o.model, o.task.bounds)):
         for name, (value, sigma, unit) in parameters_of(o, label).items():
             if abs(value) > SHOWS * sigma:
                 found.append(
@@ -996,7 +1011,7 @@ def _outstanding(o: Outcome) -> list[str]:
     """Records that hold so much of what is left that every fit is mostly theirs, in words."""
     if at_noise(o):
         return []
-    names = [name for side in o.trials for name in side]
+    names = [name for side in o.data_sets for name in side]
     squared = np.array([
         np.nansum(mse * count) for fit in (o.train, o.held)
         for mse, count in zip(fit.mse, fit.count, strict=True)
@@ -1036,7 +1051,7 @@ def _idle(o: Outcome, label: str, other: str) -> bool:
     The simpler one is nothing to within its uncertainty, and at the size that the file states the
     records would have shown it.
     """
-    if other in imperfect(o.model, o.task.bounds) or not contains(label, other):
+    if other in nuisances(o.model, o.task.bounds) or not contains(label, other):
         return False
     name, (value, sigma, _) = next(iter(parameters_of(o, other).items()), ('', (np.inf, 0.0, '')))
     first = o.model.effect(other).parameters[0]
@@ -1049,28 +1064,26 @@ def _idle(o: Outcome, label: str, other: str) -> bool:
     )
 
 
-def _cause_among(final: Outcome, label: str, contests: Sequence[Contest]) -> Cause:
+def _cause_among(final: Outcome, label: str, comparisons: Sequence[Comparison]) -> Cause:
     """The cause, judged by the contest that had the most beside it."""
-    known = [c for c in contests if (own := c.of(label)) and not own[0].reason]
+    known = [c for c in comparisons if (own := c.of(label)) and not own[0].reason]
     if not known:
         return _as_in(final, Cause(label, parameters_of(final, label), float('inf')))
-    contest = max(known, key=lambda c: len(c.base.model.effects))
-    return _as_in(final, _cause(final, label, contest))
+    comparison = max(known, key=lambda c: len(c.base.model.effects))
+    return _as_in(final, _cause(final, label, comparison))
 
 
-def _cause(final: Outcome, label: str, contest: Contest) -> Cause:
-    own = contest.of(label)
+def _cause(final: Outcome, label: str, comparison: Comparison) -> Cause:
+    own = comparison.of(label)
     assert own is not None
     name = effect_name(label)
-    close = contest.close_to(label)
+    close = comparison.close_to(label)
     return Cause(
         label,
         parameters_of(final, label),
         own[0].evidence,
         rivals=tuple(
-            c.label
-            for c in close
-            if effect_name(c.label) != name and not contains(c.label, label)
+            c.label for c in close if effect_name(c.label) != name and not contains(c.label, label)
         ),
         places=tuple(c.label for c in close if effect_name(c.label) == name),
         events=events_of(final, label),

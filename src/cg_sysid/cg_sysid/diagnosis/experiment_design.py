@@ -17,7 +17,7 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.experiments.catalogue import Experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
-from cg_sysid.identification.data_set import Trial, as_trial
+from cg_sysid.identification.data_set import DataSet, as_data_set
 from cg_sysid.identification.identify import Fit, fit, predict
 from cg_sysid.identification.information_criterion import evidence
 from cg_sysid.identification.unknowns import IdentificationError
@@ -105,10 +105,10 @@ def _rehearsed(
         for other, _ in others:
             for truth, doubted in ((accepted, other), (other, accepted)):
                 models = dict(rivals)
-                trial = imagined(models[truth].model, sigma, experiment, excitation)
+                data_set = imagined(models[truth].model, sigma, experiment, excitation)
                 # Noise alone costs some models some hundred nats, and the true one as many.
-                nats = _lost(models[doubted], trial) - _lost(models[truth], trial)
-                worth.append((nats * experiment.duration / trial.duration, (accepted, other)))
+                nats = _lost(models[doubted], data_set) - _lost(models[truth], data_set)
+                worth.append((nats * experiment.duration / data_set.duration, (accepted, other)))
     except (IdentificationError, DynamicsError, ValueError, np.linalg.LinAlgError):
         return None
     nats, weakest = min(worth)
@@ -117,7 +117,7 @@ def _rehearsed(
 
 def imagined(
     model: Model, sigma: np.ndarray, experiment: Experiment, excitation: Mapping[str, Any]
-) -> Trial:
+) -> DataSet:
     """What the first seconds of an experiment would record if the model were the machine."""
     duration = min(experiment.duration, REHEARSED_S)
     settings = ExcitationSettings(**excitation, duration=duration, seed=SEED)
@@ -134,18 +134,18 @@ def imagined(
         setup=experiment.setup,
         note={},
     )
-    trial = as_trial(body, record, sigma)
-    noise = sigma * np.random.default_rng(SEED).standard_normal(trial.outputs.shape)
-    seen = predict(model, trial, np.array(experiment.initial_state)) + noise
+    data_set = as_data_set(body, record, sigma)
+    noise = sigma * np.random.default_rng(SEED).standard_normal(data_set.outputs.shape)
+    seen = predict(model, data_set, np.array(experiment.initial_state)) + noise
     outputs = dict(zip(body.outputs, seen.T, strict=True))
-    trial = as_trial(body, replace(record, outputs=outputs), sigma)
-    begun = trial.time >= LEAD_IN_S
-    return replace(trial, outputs=np.where(begun[:, None], trial.outputs, np.nan))
+    data_set = as_data_set(body, replace(record, outputs=outputs), sigma)
+    begun = data_set.time >= LEAD_IN_S
+    return replace(data_set, outputs=np.where(begun[:, None], data_set.outputs, np.nan))
 
 
-def _lost(rival: Fit, trial: Trial) -> float:
-    """Evidence in nats that a trial gives against a model that knows what its fit knows."""
-    found = fit(rival.model, [trial], iterations=ITERATIONS)
+def _lost(rival: Fit, data_set: DataSet) -> float:
+    """Evidence in nats that a data set gives against a model that knows what its fit knows."""
+    found = fit(rival.model, [data_set], iterations=ITERATIONS)
     belief = sum(
         ((u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance) ** 2
         for u, v in zip(found.unknowns, found.values, strict=True)

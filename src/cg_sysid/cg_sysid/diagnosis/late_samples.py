@@ -5,19 +5,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from cg_interfaces.channels import mechanism
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.records.jitter import timing_error
 
 
 def late_samples(
-    trials: Sequence[Trial], body: str, outputs: Sequence[str], output: str, unit: str
+    data_sets: Sequence[DataSet], body: str, outputs: Sequence[str], output: str, unit: str
 ) -> str:
     """That samples were taken beside their stamps, and the error that this makes, in a sentence.
 
     Args:
-        trials: Records, or windows of them.
+        data_sets: Records, or windows of them.
         body: Name of the mechanism.
-        outputs: Names of the columns of the trials' outputs.
+        outputs: Names of the columns of the data sets' outputs.
         output: The one whose error is told.
         unit: Its unit.
 
@@ -27,9 +27,9 @@ def late_samples(
     sensor = next(t for t in mechanism(body).outputs if output in {c.name for c in t.channels})
     names = [c.name for c in sensor.channels if c.name in outputs]
     found, made = [], []
-    recordings = sorted({trial.recording for trial in trials})
+    recordings = sorted({data_set.recording for data_set in data_sets})
     for recording in recordings:
-        own = [trial for trial in trials if trial.recording == recording]
+        own = [data_set for data_set in data_sets if data_set.recording == recording]
         signals = {name: _joined(own, outputs.index(name)) for name in names}
         error = timing_error(signals)
         if error is not None and output in error.channels:
@@ -46,11 +46,11 @@ def late_samples(
     )
 
 
-def _joined(trials: Sequence[Trial], column: int) -> tuple[np.ndarray, np.ndarray]:
+def _joined(data_sets: Sequence[DataSet], column: int) -> tuple[np.ndarray, np.ndarray]:
     """Times in s and samples of an output over the windows of a recording, in order."""
-    windows = sorted(trials, key=lambda trial: trial.since)
-    time = np.concatenate([trial.since + trial.time for trial in windows])
-    values = np.concatenate([trial.outputs[:, column] for trial in windows])
+    windows = sorted(data_sets, key=lambda data_set: data_set.since)
+    time = np.concatenate([data_set.since + data_set.time for data_set in windows])
+    values = np.concatenate([data_set.outputs[:, column] for data_set in windows])
     there = np.isfinite(values)
     time, values = time[there], values[there]
     later = np.diff(time, prepend=-np.inf) > 0.0  # windows share the sample where one ends

@@ -7,7 +7,7 @@ report say the same.
 from collections.abc import Mapping
 from typing import Any
 
-from cg_sysid.search.candidates import STRAINED
+from cg_sysid.search.candidates import PRIOR_CONFLICT
 from cg_sysid.search.ranking import MARGIN
 from cg_sysid.text import effect_name, listed, number
 
@@ -32,7 +32,9 @@ def next_step(facts: Mapping[str, Any]) -> str:
     """
     broken_off = (
         'Run the same command again with a longer --budget: it goes on from the fits that are '
-        'kept. ' if facts.get('unfinished') else ''
+        'kept. '
+        if facts.get('unfinished')
+        else ''
     )
     return broken_off + _AFTER[facts['verdict']](facts)
 
@@ -40,7 +42,7 @@ def next_step(facts: Mapping[str, Any]) -> str:
 def _consistent(facts: Mapping[str, Any]) -> str:
     away = [
         p['name'] for p in facts['parameters']
-        if p['moved_tolerances'] is not None and abs(p['moved_tolerances']) > STRAINED
+        if p['moved_tolerances'] is not None and abs(p['moved_tolerances']) > PRIOR_CONFLICT
     ]  # fmt: skip
     if away:
         return (

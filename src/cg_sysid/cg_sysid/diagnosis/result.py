@@ -14,7 +14,7 @@ from cg_dynamics.model import Model
 from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.diagnosis.experiment_design import Proposal
 from cg_sysid.experiments.catalogue import Experiment
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.measured_start import MeasuredStart
@@ -69,8 +69,8 @@ class Diagnosis:
         baseline: The same, its parameters identified on the training records.
         extended: The model with the causes in it, identified on the training records.
         rounds: What was tried, in order.
-        train: Trials used for fitting.
-        held: Trials held out.
+        train: Data sets used for fitting.
+        held: Data sets held out.
         remaining: chi2/N of each output that the extended model leaves on held-out records.
         findings: What a person should know: warnings of the fits, lumps out of tolerance.
         unmodelled: What the extended model leaves above the noise, as a learned term; None if it
@@ -93,8 +93,8 @@ class Diagnosis:
     baseline: Candidate
     extended: Candidate
     rounds: tuple[Round, ...]
-    train: tuple[Trial, ...]
-    held: tuple[Trial, ...]
+    train: tuple[DataSet, ...]
+    held: tuple[DataSet, ...]
     remaining: dict[str, float]
     findings: tuple[str, ...] = ()
     unmodelled: Unmodelled | None = None
@@ -130,10 +130,8 @@ class Options:
     wholes: tuple[Record, ...] = ()
 
 
-def gains_of(
-    model: Model, held: Sequence[Trial], before: Fit, after: Fit
-) -> tuple[Gain, ...]:
-    """Error of each output before and after on the held-out trials."""
+def gains_of(model: Model, held: Sequence[DataSet], before: Fit, after: Fit) -> tuple[Gain, ...]:
+    """Error of each output before and after on the held-out data sets."""
     sigma = held[0].sigma
     return tuple(
         Gain(channel, unit, float(s * np.sqrt(b)), float(s * np.sqrt(a)), float(s))

@@ -22,7 +22,7 @@ def summary_of(
     causes: Sequence[Cause],
     gains: Sequence[Gain],
     left: dict[str, float],
-    strained: Sequence[str] = (),
+    prior_conflicts: Sequence[str] = (),
     unmodelled: Unmodelled | None = None,
     tried: Sequence[str] | None = None,
     wandering: Wandering | None = None,
@@ -36,7 +36,7 @@ def summary_of(
         causes: Named causes.
         gains: Errors before and after.
         left: Outputs with an error above the noise.
-        strained: Numbers that the file does not believe.
+        prior_conflicts: Numbers that the file does not believe.
         unmodelled: What is left, as a learned term.
         tried: Effects that were tried; None for the whole library.
         wandering: A number that differs from recording to recording.
@@ -50,8 +50,8 @@ def summary_of(
                 ', with what sound robots have besides: small faults and laws of another shape, '
                 'which the findings list and model.yaml holds'
             )
-        if strained:
-            text += f', but with {", ".join(strained)} far from what its file believes'
+        if prior_conflicts:
+            text += f', but with {", ".join(prior_conflicts)} far from what its file believes'
         return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
     if verdict == 'unexplained':
@@ -77,10 +77,10 @@ def summary_of(
             'found so far.'
         )
         return f'{text} {named} takes {100 * explained:.0f} % of it.' if causes else text
-    if biggest.before < NO_GAIN * biggest.after and strained:
+    if biggest.before < NO_GAIN * biggest.after and prior_conflicts:
         text = (
             f'The simulation lacks {named}: without it the model follows the records only with '
-            f'{", ".join(strained)} far from what its file believes.'
+            f'{", ".join(prior_conflicts)} far from what its file believes.'
         )
     else:
         text = (
@@ -136,9 +136,8 @@ def _happened(cause: Cause, names: Sequence[str]) -> list[str]:
     """Each event with its record, the largest first; how many more there are."""
     ordered = sorted(cause.events, key=lambda record: -abs(cause.events[record][names[0]][0]))
     told = [
-        f'in {record} ' + ', '.join(
-            f'{name} = {measured(*cause.events[record][name])}' for name in names
-        )
+        f'in {record} '
+        + ', '.join(f'{name} = {measured(*cause.events[record][name])}' for name in names)
         for record in ordered[:MOST_TOLD]
     ]
     more = len(ordered) - len(told)

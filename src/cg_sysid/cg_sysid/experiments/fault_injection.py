@@ -39,11 +39,16 @@ def as_recorded(record: Record, seed: int = 0) -> RawRecording:
         delay = np.rint(rng.gamma(2.0, ARRIVAL_S, len(stamp)) * NS_PER_S).astype(np.int64)
         absent = {name: np.zeros(len(stamp), bool) for name in values}
         arrival = np.maximum.accumulate(stamp + delay)
-        topics[topic.name] = RawTopic(topic.name, topic.msgtype, stamp.copy(), arrival, values,
-                                      absent)
+        topics[topic.name] = RawTopic(
+            topic.name, topic.msgtype, stamp.copy(), arrival, values, absent
+        )
     note = {
-        'sensor_zeros': {}, 'zeroed_at': '2011-03-13T07:00:00Z', 'model_file': 'none.yaml',
-        'model_sha256': '0' * 64, 'software': 'rehearsal', **record.note,
+        'sensor_zeros': {},
+        'zeroed_at': '2011-03-13T07:00:00Z',
+        'model_file': 'none.yaml',
+        'model_sha256': '0' * 64,
+        'software': 'rehearsal',
+        **record.note,
     }
     return RawRecording(record.name, note, record.mechanism, topics)
 
@@ -121,8 +126,7 @@ def _values(
     def fault(raw: RawRecording) -> RawRecording:
         for topic in raw.topics.values():
             values = {
-                c: change(v, _time(topic)) if c in channels else v
-                for c, v in topic.values.items()
+                c: change(v, _time(topic)) if c in channels else v for c, v in topic.values.items()
             }
             raw = _with(raw, replace(topic, values=values))
         return raw
@@ -130,20 +134,21 @@ def _values(
     return fault
 
 
-def _samples(
-    topic: str, keep: Callable[[int, np.ndarray], np.ndarray], honest: bool
-) -> Fault:
+def _samples(topic: str, keep: Callable[[int, np.ndarray], np.ndarray], honest: bool) -> Fault:
     def fault(raw: RawRecording) -> RawRecording:
         for name in _names(raw, topic):
             old = raw.topics[name]
             index = keep(len(old), _time(old))
-            raw = _with(raw, replace(
-                old,
-                stamp_ns=old.stamp_ns[index] if honest else old.stamp_ns[: len(index)],
-                log_ns=old.log_ns[index],
-                values={c: v[index] for c, v in old.values.items()},
-                absent={c: v[index] for c, v in old.absent.items()},
-            ))
+            raw = _with(
+                raw,
+                replace(
+                    old,
+                    stamp_ns=old.stamp_ns[index] if honest else old.stamp_ns[: len(index)],
+                    log_ns=old.log_ns[index],
+                    values={c: v[index] for c, v in old.values.items()},
+                    absent={c: v[index] for c, v in old.absent.items()},
+                ),
+            )
         return raw
 
     return fault

@@ -1,4 +1,4 @@
-"""A trial: one record made ready for simulation beside it.
+"""A data set: one record made ready for simulation beside it.
 
 Arrays in the order of the model's channels, standard deviations that say how well each channel
 can be matched at all, and a first guess of the motion at the first row.
@@ -27,7 +27,7 @@ SMALLEST_SIGMA = {'rad': 1e-6, 'rad/s': 1e-5, 'm': 1e-6, 'm/s': 1e-5}
 
 
 @dataclass(frozen=True)
-class Trial:
+class DataSet:
     """A record as arrays.
 
     Attributes:
@@ -84,8 +84,8 @@ class Trial:
         return float(self.time[-1])
 
 
-def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
-    """Trials of records that belong to one model's machine.
+def prepare(model: Model, records: Sequence[Record]) -> list[DataSet]:
+    """Data sets of records that belong to one model's machine.
 
     The noise of a channel is what the model file states or what the records show, whichever is
     larger, one value for all records: a sensor does not change from one record to the next.
@@ -104,7 +104,7 @@ def prepare(model: Model, records: Sequence[Record]) -> list[Trial]:
     sigma = noise_floor(model, records)
     starts = session_starts(records)
     return [
-        replace(as_trial(body, record, sigma), session=starts[recording_of(record)])
+        replace(as_data_set(body, record, sigma), session=starts[recording_of(record)])
         for record in records
     ]
 
@@ -149,15 +149,15 @@ def noise_floor(model: Model, records: Sequence[Record]) -> np.ndarray:
     return np.array(floor)
 
 
-def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
-    """The trial of one record, given the noise floor of each output, shape (ny,)."""
+def as_data_set(body: Mechanism, record: Record, sigma: np.ndarray) -> DataSet:
+    """The data set of one record, given the noise floor of each output, shape (ny,)."""
     time = record.time
     names = (*body.inputs, *(name for name in record.inputs if name not in body.inputs))
     outputs = np.column_stack(
         [record.outputs.get(channel, np.full(len(time), np.nan)) for channel in body.outputs]
     )
     motion, noise = measured_motion(body, record.setup, time, outputs, sigma)
-    return Trial(
+    return DataSet(
         name=record.name,
         recording=recording_of(record),
         time=time,
@@ -173,33 +173,33 @@ def as_trial(body: Mechanism, record: Record, sigma: np.ndarray) -> Trial:
     )
 
 
-def pieces(body: Mechanism, trial: Trial, length: float) -> list[tuple[float, Trial]]:
-    """The trial cut into consecutive pieces of a length in s, each with a motion of its own.
+def pieces(body: Mechanism, data_set: DataSet, length: float) -> list[tuple[float, DataSet]]:
+    """The data set cut into consecutive pieces of a length in s, each with a motion of its own.
 
     A rest shorter than half of that is left out, and so is what begins without samples.
 
     Returns:
         When each begins, in s, and the piece.
     """
-    cuts = np.searchsorted(trial.time, np.arange(0.0, trial.duration, length))
+    cuts = np.searchsorted(data_set.time, np.arange(0.0, data_set.duration, length))
     found = []
-    for a, b in itertools.pairwise([*cuts, len(trial.time)]):
-        time, outputs = trial.time[a:b] - trial.time[a], trial.outputs[a:b]
+    for a, b in itertools.pairwise([*cuts, len(data_set.time)]):
+        time, outputs = data_set.time[a:b] - data_set.time[a], data_set.outputs[a:b]
         if b - a < 2 or time[-1] < length / 2 or not np.isfinite(outputs).any():
             continue
-        motion, noise = trial.motion, trial.motion_noise
-        spread = trial.motion_sigma
+        motion, noise = data_set.motion, data_set.motion_noise
+        spread = data_set.motion_sigma
         if a > 0:
             if np.isfinite(outputs[time <= START_WINDOW]).sum(axis=0).max() < 3:
                 continue  # samples are missing there
-            motion, noise = measured_motion(body, trial.setup, time, outputs, trial.sigma)
+            motion, noise = measured_motion(body, data_set.setup, time, outputs, data_set.sigma)
             spread = _generous(motion, noise)
         piece = replace(
-            trial, name=f'{trial.name}[{a}:{b}]', time=time, inputs=trial.inputs[a:b],
+            data_set, name=f'{data_set.name}[{a}:{b}]', time=time, inputs=data_set.inputs[a:b],
             outputs=outputs, motion=motion, motion_sigma=spread,
-            since=trial.since + float(trial.time[a]), motion_noise=noise,
+            since=data_set.since + float(data_set.time[a]), motion_noise=noise,
         )  # fmt: skip
-        found.append((float(trial.time[a]), piece))
+        found.append((float(data_set.time[a]), piece))
     return found
 
 
@@ -273,4 +273,3 @@ def measured_motion(
     motion, *_ = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)
     information = (a * w[:, None]).T @ (a * w[:, None])
     return motion, np.linalg.pinv(information)
-

@@ -24,7 +24,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
 from cg_sysid.identification import kept_fits
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
     BARRIER,
@@ -89,9 +89,9 @@ class _End:
 
     Attributes:
         theta: Coordinates of the unknowns, shape (k,).
-        motions: What each trial has of its own.
+        motions: What each data set has of its own.
         cost: Final cost.
-        sse: Squared error over noise variance of each trial and output, shape (trials, ny).
+        sse: Squared error over noise variance of each data set and output, shape (data sets, ny).
         count: Samples behind it.
         weight: Of the residual in the cost.
         converged: Whether it is a minimum.
@@ -139,13 +139,13 @@ class Fit:
         covariance: Of the unknowns' coordinates (log where logarithmic), shape (k, k).
         information: Share of each unknown's certainty that comes from data, 0 (all from the
             model file's belief) to 1.
-        motions: What each trial has of its own: initial motion, (2m,), how far extra states are
+        motions: What each data set has of its own: initial motion, (2m,), how far extra states are
             from settled at its start (`unsettled_states`, in their spreads), then one value for
             each of `own`.
         own: Parameters of which every record has a value of its own (a push's instant).
-        own_sigmas: Standard deviation of these, shape (len(own),) for each trial.
+        own_sigmas: Standard deviation of these, shape (len(own),) for each data set.
         cost: Final cost J, in squared noise standard deviations.
-        mse: Mean squared error of each trial and output, in squared noise, shape (trials, ny).
+        mse: Mean squared error of each data set and output, in squared noise, shape (n, ny).
         count: Samples behind `mse`.
         inflation: Variance of the residual over that of the noise, as used in the weights.
         horizon: Length of the records used, in s.
@@ -190,25 +190,26 @@ class Fit:
         """Positive numbers without a belief of which not even the order is known."""
         relative = np.sqrt(np.clip(np.diag(self.covariance), 0, None))
         return tuple(
-            u.name for u, spread in zip(self.unknowns, relative, strict=True)
+            u.name
+            for u, spread in zip(self.unknowns, relative, strict=True)
             if u.logarithmic and not np.isfinite(u.tolerance) and spread > ORDER
         )
 
-    def own_by_name(self, trials: Sequence[Trial]) -> dict[str, dict[str, float]]:
-        """What was found of each trial alone: its name -> full name -> value."""
+    def own_by_name(self, data_sets: Sequence[DataSet]) -> dict[str, dict[str, float]]:
+        """What was found of each data set alone: its name -> full name -> value."""
         count = len(self.own)
         return {
-            trial.name: {
+            data_set.name: {
                 u.name: float(v)
                 for u, v in zip(self.own, motion[len(motion) - count :], strict=True)
             }
-            for trial, motion in zip(trials, self.motions, strict=True)
+            for data_set, motion in zip(data_sets, self.motions, strict=True)
             if count
         }
 
     @property
     def squares(self) -> float:
-        """Squared error over noise variance, all trials and outputs together."""
+        """Squared error over noise variance, all data sets and outputs together."""
         return float((self.mse * self.count).sum())
 
     @property
@@ -222,13 +223,13 @@ class Fit:
 
     @property
     def normalised_error(self) -> float:
-        """Mean squared error over noise variance, all trials and outputs together."""
+        """Mean squared error over noise variance, all data sets and outputs together."""
         return float(np.nansum(self.mse * self.count) / self.count.sum())
 
 
 def fit(
     model: Model,
-    trials: Sequence[Trial],
+    data_sets: Sequence[DataSet],
     only: Sequence[str] | None = None,
     iterations: int = 60,
     reweight: bool = True,
@@ -242,18 +243,18 @@ def fit(
     sure: bool = True,
     progress: Progress = lambda what, done, total, best: None,
 ) -> Fit:
-    """Identify a model's parameters from trials.
+    """Identify a model's parameters from data sets.
 
     Args:
         model: What is believed: values, tolerances, bounds. The search sets out from there.
-        trials: Prepared records (trial.prepare).
+        data_sets: Prepared records (data set.prepare).
         only: Full names of the parameters to identify; by default all that are free.
         iterations: Limit for the last, full-length stage.
         reweight: Let the weights follow the residual that is left.
         horizon: Use only this much of each record, in s: a cheap first look.
         start: Set out from this fit of the same unknowns to a shorter horizon instead.
         at: Set out from these values (full name -> value) instead of those of the file.
-        own: Name of a trial -> first guesses, by full name, of what it has of its own beyond its
+        own: Name of a data set -> first guesses, by full name, of what it has beyond its
             initial motion (`own_unknowns`); without one the model's value is the guess.
         bounds: Parameters that stay near the model's value (`unknowns_of`).
         thorough: Down to the very bottom, at several times the cost: until a tenth of a squared
@@ -266,19 +267,21 @@ def fit(
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
     """
-    if not trials:
+    if not data_sets:
         raise IdentificationError('no record to identify from; at least one is needed')
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only, bounds)
     refinement = REFINED if thorough else 1.0
-    problem = Problem(model, trials, unknowns, _guesses(model, trials, own or {}), refinement)
+    problem = Problem(
+        model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement
+    )
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motions = list(problem.guesses if start is None else start.motions)
-    longest = min(max(trial.duration for trial in trials), horizon)
+    longest = min(max(data_set.duration for data_set in data_sets), horizon)
     weight = 1.0 if start is None else 1 / start.inflation
     place = kept_fits.place_of(
-        model, trials, names=[u.name for u in unknowns], theta=theta, motions=motions,
+        model, data_sets, names=[u.name for u in unknowns], theta=theta, motions=motions,
         guesses=problem.guesses, longest=longest, weight=weight, reweight=reweight,
         behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
         thorough=thorough, reach=reach,
@@ -309,7 +312,7 @@ def fit(
         own=problem.own,
         own_sigmas=tuple(s[unsettled:] for s in sigmas),
         starts=_demanded(
-            [m[len(t.motion) :][:unsettled] for t, m in zip(trials, end.motions, strict=True)],
+            [m[len(t.motion) :][:unsettled] for t, m in zip(data_sets, end.motions, strict=True)],
             [s[:unsettled] for s in sigmas],
         ),
         cost=end.cost,
@@ -363,8 +366,8 @@ def _descend(
         if found.point is None:
             raise IdentificationError(
                 f'model {problem.model.name!r} runs away along the data '
-                f'({", ".join(t.name for t in problem.trials)}); its values are too far off, or '
-                'the records are too long for an unstable motion: cut them into windows'
+                f'({", ".join(t.name for t in problem.data_sets)}); its values are too far off, '
+                'or the records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(problem, found.point) if reweight else 1.0
         # A minimum under weights that are about to change is none yet.
@@ -381,18 +384,19 @@ def _descend(
 
 
 def _guesses(
-    model: Model, trials: Sequence[Trial], own: Mapping[str, Mapping[str, float]]
+    model: Model, data_sets: Sequence[DataSet], own: Mapping[str, Mapping[str, float]]
 ) -> list[np.ndarray]:
     stated = {u.name: u.prior for u in own_unknowns(model)}
     settled = [0.0] * len(unsettled_states(model))
     return [
         np.array(
             [
-                *trial.motion, *settled,
-                *(own.get(trial.name, {}).get(n, v) for n, v in stated.items()),
+                *data_set.motion,
+                *settled,
+                *(own.get(data_set.name, {}).get(n, v) for n, v in stated.items()),
             ]
         )
-        for trial in trials
+        for data_set in data_sets
     ]
 
 
@@ -407,8 +411,12 @@ def _minimise(
     reach: float,
     leading: bool = False,
 ) -> _Descent:
-    lower = np.array([u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
-                      for u in problem.unknowns])
+    lower = np.array(
+        [
+            u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
+            for u in problem.unknowns
+        ]
+    )
     upper = np.array([u.to_coordinate(u.upper) for u in problem.unknowns])
     point = evaluate(problem, theta, motions, horizon, weight)
     if point is None:
@@ -510,9 +518,7 @@ def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray,
     return step, factors
 
 
-def _unseen(
-    problem: Problem, theta: np.ndarray, point: Point, weight: float
-) -> np.ndarray:
+def _unseen(problem: Problem, theta: np.ndarray, point: Point, weight: float) -> np.ndarray:
     """Unknowns whose typical change these few seconds do not notice, such as a late push."""
     values = problem.values(theta)
     scales = np.array([u.scale for u in problem.unknowns]) / problem.chain(values)
@@ -520,7 +526,7 @@ def _unseen(
 
 
 def _weight(problem: Problem, point: Point) -> float:
-    step = np.median(np.concatenate([np.diff(trial.time) for trial in problem.trials]))
+    step = np.median(np.concatenate([np.diff(data_set.time) for data_set in problem.data_sets]))
     return float(weight_of(point.sse.sum() / point.count.sum(), step))
 
 
@@ -611,8 +617,8 @@ def _warnings(fit: Fit, bounds: Collection[str]):
                     )
 
 
-def in_trial(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
-    """The model with what a trial has of its own (Fit.motions), and its start, (nx,).
+def in_data_set(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
+    """The model with what a data set has of its own (Fit.motions), and its start, (nx,).
 
     The start is as `CompiledModel.initial_state` takes it.
     """
@@ -627,39 +633,39 @@ def in_trial(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
 
 
 def predict(
-    model: Model, trial: Trial, motion: np.ndarray, refinement: float = 1.0
+    model: Model, data_set: DataSet, motion: np.ndarray, refinement: float = 1.0
 ) -> np.ndarray:
-    """Outputs that a model simulates along a trial, shape (n, ny).
+    """Outputs that a model simulates along a data set, shape (n, ny).
 
     Args:
         model: The model.
-        trial: The trial.
-        motion: What the trial has of its own (Fit.motions).
+        data_set: The data set.
+        motion: What the data set has of its own (Fit.motions).
         refinement: As the fit's.
     """
-    model, motion = in_trial(model, motion)
-    compiled = compile_model(model, trial.setup)
-    p = parameter_vector(model, trial.setup)
-    u = trial.inputs_for(compiled.input_names)
+    model, motion = in_data_set(model, motion)
+    compiled = compile_model(model, data_set.setup)
+    p = parameter_vector(model, data_set.setup)
+    u = data_set.inputs_for(compiled.input_names)
     x0 = compiled.initial_state(motion, u[0], p)
-    return compiled.readings(trial.time, u, x0, p, refinement)
+    return compiled.readings(data_set.time, u, x0, p, refinement)
 
 
 def score(
     model: Model,
-    trials: Sequence[Trial],
+    data_sets: Sequence[DataSet],
     unseen: Sequence[str] = (),
     own: Mapping[str, Mapping[str, float]] | None = None,
     bounds: Mapping[str, float] | None = None,
     thorough: bool = False,
     reach: float = np.inf,
 ) -> Fit:
-    """How well a model simulates trials that it was not fitted to.
+    """How well a model simulates data sets that it was not fitted to.
 
-    Only what each trial has of its own is fitted: its initial motion, as no recording states it
+    Only what each data set has of its own is fitted: its initial motion, as no recording states it
     exactly, and what happened in it alone, from the guess `own` (see `fit`); and parameters
     `unseen` of which the others could tell nothing, as the shape of a push that none of them had.
     """
     return fit(
-        model, trials, only=unseen, own=own, bounds=bounds, thorough=thorough, reach=reach
+        model, data_sets, only=unseen, own=own, bounds=bounds, thorough=thorough, reach=reach
     )

@@ -89,9 +89,7 @@ def evidence(
     )
 
 
-def block_gain(
-    before: Sequence[np.ndarray], after: Sequence[np.ndarray], rows: int
-) -> float:
+def block_gain(before: Sequence[np.ndarray], after: Sequence[np.ndarray], rows: int) -> float:
     """How significantly the error fell, in standard errors, by the ranks of blocks of time.
 
     Wilcoxon's signed ranks, because squared errors have heavy tails: a push shows in few blocks

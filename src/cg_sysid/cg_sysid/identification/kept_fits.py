@@ -1,9 +1,9 @@
 """Where fits came to, kept in a folder: what was fitted before is not fitted again.
 
     with kept_in(Path('results/fits')):
-        fit(model, trials)  # a second time it takes no longer than its uncertainty
+        fit(model, data sets)  # a second time it takes no longer than its uncertainty
 
-A file is named by all that decides a fit: model, trials, options, and the source of this software.
+A file is named by all that decides a fit: model, data sets, options, and this source.
 What was broken off, or killed at any instant, goes on from the fits that were finished.
 """
 
@@ -26,7 +26,7 @@ from cg_description.model_file import write_atomically
 from cg_description.reading import JSON, DocumentError, parse_json, read_text
 from cg_dynamics.cluster import source_hash
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 
 _folder: ContextVar[Path | None] = ContextVar('folder of fits', default=None)
 
@@ -47,12 +47,12 @@ def keeping(folder: Path | None, function: Callable[..., Any], *arguments: Any) 
         return function(*arguments)
 
 
-def place_of(model: Model, trials: Sequence[Trial], **options: Any) -> Path | None:
+def place_of(model: Model, data_sets: Sequence[DataSet], **options: Any) -> Path | None:
     """The file of a fit; None where none is kept.
 
     Args:
         model: The model to fit.
-        trials: What to.
+        data_sets: What to.
         options: Whatever else decides where the fit comes to.
     """
     folder = _folder.get()
@@ -60,9 +60,9 @@ def place_of(model: Model, trials: Sequence[Trial], **options: Any) -> Path | No
         return None
     digest = hashlib.sha256(_software().encode())
     digest.update(model.text().encode())
-    for trial in trials:
-        for field in fields(trial):
-            _add(digest, getattr(trial, field.name))
+    for data_set in data_sets:
+        for field in fields(data_set):
+            _add(digest, getattr(data_set, field.name))
     _add(digest, options)
     return folder / f'{digest.hexdigest()[:32]}.json'
 

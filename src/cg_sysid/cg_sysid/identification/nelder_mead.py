@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, Progress, score
 from cg_sysid.identification.simulation_error import Problem
 from cg_sysid.identification.unknowns import (
@@ -37,7 +37,7 @@ RUNAWAY = 1e30  # cost where the simulation runs away or no real body has the pa
 
 def nelder_mead(
     model: Model,
-    trials: Sequence[Trial],
+    data_sets: Sequence[DataSet],
     only: Sequence[str] | None = None,
     evaluations: int | None = None,
     progress: Progress = lambda what, done, total, best: None,
@@ -46,7 +46,7 @@ def nelder_mead(
 
     Args:
         model: Where to start.
-        trials: Prepared records.
+        data_sets: Prepared records.
         only: Full names of the parameters to identify; by default all that are free.
         evaluations: Limit of simulations of all records.
         progress: Called with (what, done, total, how good it is so far in words).
@@ -57,7 +57,7 @@ def nelder_mead(
     Raises:
         IdentificationError: if the model cannot be simulated along the data at all.
     """
-    if not trials:
+    if not data_sets:
         raise IdentificationError('no record to identify from; at least one is needed')
     unknowns = unknowns_of(model, only)
     if not unknowns:
@@ -68,13 +68,13 @@ def nelder_mead(
             f'{own_unknowns(model)[0].name}; use gauss-newton'
         )
     began = clock.perf_counter()
-    guesses = [trial.motion for trial in trials]
-    cost = _Cost(Problem(model, trials, unknowns, guesses), _motions(model, trials))
+    guesses = [data_set.motion for data_set in data_sets]
+    cost = _Cost(Problem(model, data_sets, unknowns, guesses), _motions(model, data_sets))
     values = np.array([u.prior for u in unknowns])
     if cost(values) >= RUNAWAY:
         raise IdentificationError(
             f'model {model.name!r} runs away along the data '
-            f'({", ".join(t.name for t in trials)}); a simplex search cannot start there'
+            f'({", ".join(t.name for t in data_sets)}); a simplex search cannot start there'
         )
     limit = evaluations or EVALUATIONS_PER_UNKNOWN * len(values)
     cost.progress = lambda done, best: progress('simplex search', done, limit, best)
@@ -83,7 +83,7 @@ def nelder_mead(
         settled = found.success and np.allclose(found.x, values, rtol=TOLERANCE, atol=1e-9)
         values = found.x
         here = model.with_values(dict(zip((u.name for u in unknowns), values, strict=True)))
-        cost.motions = _motions(here, trials)
+        cost.motions = _motions(here, data_sets)
         if settled or cost.problem.evaluations >= limit:
             break
     sse, count = cost.errors(values)
@@ -91,8 +91,10 @@ def nelder_mead(
     quantities = dict(here.quantities)
     for u in unknowns:
         quantities[u.name] = replace(quantities[u.name], source='identified by Nelder-Mead')
-    stopped = () if found.success else (
-        f'the simplex search stopped at its limit of {limit} simulations',
+    stopped = (
+        ()
+        if found.success
+        else (f'the simplex search stopped at its limit of {limit} simulations',)
     )
     return Fit(
         model=replace(here, quantities=quantities),
@@ -102,12 +104,12 @@ def nelder_mead(
         information=np.full(k, np.nan),
         motions=tuple(cost.motions),
         own=(),
-        own_sigmas=tuple(np.zeros(0) for _ in trials),
+        own_sigmas=tuple(np.zeros(0) for _ in data_sets),
         cost=float(sse.sum()),
         mse=sse / np.maximum(count, 1),
         count=count,
         inflation=1.0,
-        horizon=max(trial.duration for trial in trials),
+        horizon=max(data_set.duration for data_set in data_sets),
         evaluations=cost.problem.evaluations,
         seconds=clock.perf_counter() - began,
         refinement=1.0,
@@ -116,12 +118,12 @@ def nelder_mead(
     )
 
 
-def _motions(model: Model, trials: Sequence[Trial]) -> list[np.ndarray]:
+def _motions(model: Model, data_sets: Sequence[DataSet]) -> list[np.ndarray]:
     try:
-        return list(score(model, trials).motions)
+        return list(score(model, data_sets).motions)
     except IdentificationError:
         settled = np.zeros(len(unsettled_states(model)))
-        return [np.concatenate([trial.motion, settled]) for trial in trials]
+        return [np.concatenate([data_set.motion, settled]) for data_set in data_sets]
 
 
 def _search(cost: '_Cost', start: np.ndarray, evaluations: int) -> 'scipy.optimize.OptimizeResult':
@@ -175,21 +177,21 @@ class _Cost:
         return float(sse.sum()) if np.isfinite(sse).all() else RUNAWAY
 
     def errors(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared error over noise variance and samples, each of shape (trials, ny)."""
+        """Squared error over noise variance and samples, each of shape (data sets, ny)."""
         problem = self.problem
-        ny = len(problem.trials[0].sigma)
-        sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
-        for i, trial in enumerate(problem.trials):
+        ny = len(problem.data_sets[0].sigma)
+        sse, count = np.zeros((len(problem.data_sets), ny)), np.zeros((len(problem.data_sets), ny))
+        for i, data_set in enumerate(problem.data_sets):
             compiled, p = problem.compiled[i], problem.vectors[i]
             p[problem.places[i]] = values
-            x0 = compiled.initial_state(self.motions[i][problem.starts[i]], trial.inputs[0], p)
+            x0 = compiled.initial_state(self.motions[i][problem.starts[i]], data_set.inputs[0], p)
             no_columns = np.zeros((compiled.nx, 0))
             unmoved = np.full(len(compiled.free), -1)
             normal, _, _ = compiled.normal(
-                trial.time, trial.inputs, x0, no_columns, p, unmoved,
-                trial.outputs, 1 / trial.sigma,
+                data_set.time, data_set.inputs, x0, no_columns, p, unmoved,
+                data_set.outputs, 1 / data_set.sigma,
             )  # fmt: skip
-            whole = normal.rows == len(trial.time)
+            whole = normal.rows == len(data_set.time)
             sse[i] = normal.sse if whole else np.inf
             count[i] = normal.count
         return sse, count

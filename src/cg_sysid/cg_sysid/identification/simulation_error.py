@@ -1,9 +1,9 @@
 """The simulation error of many records and its normal equations: theory.md, (ID).
 
-One evaluation simulates every trial with exact sensitivities and adds up the normal equations.
-Each trial's own unknowns, its initial motion, couple to the shared parameters only, so that a
+One evaluation simulates every data set with exact sensitivities and adds up the normal equations.
+Each data set's own unknowns, its initial motion, couple to the shared parameters only, so that a
 Schur complement leaves a system as small as the number of parameters, however many records. Where
-trials are pieces of one recording and share something of its own, they are eliminated together.
+data sets are pieces of one recording and share something of its own, they are eliminated together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import CompiledModel, Normal, compile_model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.unknowns import Unknown, awake, own_unknowns, unsettled_states
 from cg_sysid.parallel import side_by_side
 
@@ -27,7 +27,7 @@ BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one sq
 class Problem:
     """Compiled models and constants of one fit.
 
-    What a trial has of its own is one vector: its initial motion, how far extra states are from
+    What a data set has of its own is one vector: its initial motion, how far extra states are from
     settled at its start (`unsettled_states`, in their spreads), then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
@@ -35,7 +35,7 @@ class Problem:
     """
 
     model: Model
-    trials: Sequence[Trial]
+    data_sets: Sequence[DataSet]
     unknowns: tuple[Unknown, ...]
     guesses: Sequence[np.ndarray]
     refinement: float = 1.0
@@ -58,43 +58,45 @@ class Problem:
         own = [u.name for u in self.own]
         default = compile_free(self.model, names)
         model = awake(self.model)
-        for trial in self.trials:
-            compiled = compile_model(model, trial.setup, default)
+        for data_set in self.data_sets:
+            compiled = compile_model(model, data_set.setup, default)
             m2 = 2 * compiled.equations.coordinates
             order = [*unsettled, *own, *names]
             self.spreads.append(
                 np.concatenate(
-                    [trial.motion_sigma, np.ones(len(unsettled)), [u.tolerance for u in self.own]]
+                    [
+                        data_set.motion_sigma,
+                        np.ones(len(unsettled)),
+                        [u.tolerance for u in self.own],
+                    ]
                 )
             )
             at = [m2 + unsettled.index(s) for s in compiled.state_names[m2:]]
             self.starts.append(np.concatenate([np.arange(m2), at]).astype(int))
-            self.own_places.append(
-                np.array([compiled.parameter_names.index(n) for n in own], int)
-            )
+            self.own_places.append(np.array([compiled.parameter_names.index(n) for n in own], int))
             self.compiled.append(compiled)
-            self.inputs.append(trial.inputs_for(compiled.input_names))
-            self.vectors.append(parameter_vector(self.model, trial.setup))
+            self.inputs.append(data_set.inputs_for(compiled.input_names))
+            self.vectors.append(parameter_vector(self.model, data_set.setup))
             self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
             self.columns.append(
                 np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)
             )
         self.consistency = _consistency(self.model, names)
-        self.blocks = _blocks(self.trials, self.own, len(unsettled))
+        self.blocks = _blocks(self.data_sets, self.own, len(unsettled))
         shared = np.array([u.each == 'recording' for u in self.own], bool)
         for block in self.blocks:
-            for i in block.trials[1:]:
+            for i in block.data_sets[1:]:
                 # What a recording has of its own is believed once.
                 self.spreads[i][len(self.spreads[i]) - len(shared) :][shared] = np.inf
 
     def spread(self, i: int, weight: float) -> np.ndarray:
-        """How far what trial i has of its own may lie from its first guess.
+        """How far what data set i has of its own may lie from its first guess.
 
         The guess of a motion was made from the same data and weighs as they do: a simulation that
         is wrong starts as far from where the machine did as it goes on.
         """
         scale = np.ones(len(self.spreads[i]))
-        scale[: len(self.trials[i].motion)] /= np.sqrt(weight)
+        scale[: len(self.data_sets[i].motion)] /= np.sqrt(weight)
         return self.spreads[i] * scale
 
     def values(self, theta: np.ndarray) -> np.ndarray:
@@ -110,32 +112,32 @@ class Problem:
 
 @dataclass(frozen=True)
 class Block:
-    """Trials whose own unknowns are eliminated together.
+    """Data sets whose own unknowns are eliminated together.
 
     Attributes:
-        trials: Their numbers.
+        data_sets: Their numbers.
         places: Of each, where its own vector lies in the block's.
         size: Length of the block's.
     """
 
-    trials: tuple[int, ...]
+    data_sets: tuple[int, ...]
     places: tuple[np.ndarray, ...]
     size: int
 
 
 def _blocks(
-    trials: Sequence[Trial], own: Sequence[Unknown], unsettled: int
+    data_sets: Sequence[DataSet], own: Sequence[Unknown], unsettled: int
 ) -> tuple[Block, ...]:
-    """Each trial alone or, where something belongs to a recording, with the others of that."""
+    """Each data set alone or, where something belongs to a recording, with the others of that."""
     shared = np.array([u.each == 'recording' for u in own], bool)
     together: dict[str, list[int]] = {}
-    for i, trial in enumerate(trials):
-        together.setdefault(trial.recording if shared.any() else str(i), []).append(i)
+    for i, data_set in enumerate(data_sets):
+        together.setdefault(data_set.recording if shared.any() else str(i), []).append(i)
     blocks = []
     for members in together.values():
         places, size = [], int(shared.sum())
         for i in members:
-            first = len(trials[i].motion) + unsettled
+            first = len(data_sets[i].motion) + unsettled
             alone = first + int((~shared).sum())
             place = np.empty(first + len(own), int)
             place[np.concatenate([np.ones(first, bool), ~shared])] = size + np.arange(alone)
@@ -221,8 +223,8 @@ def evaluate(
     own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     cost = 0.0
     border = Border(0.0, shared_g, shared_h)
-    ny = len(problem.trials[0].sigma)
-    sse, count = np.zeros((len(problem.trials), ny)), np.zeros((len(problem.trials), ny))
+    ny = len(problem.data_sets[0].sigma)
+    sse, count = np.zeros((len(problem.data_sets), ny)), np.zeros((len(problem.data_sets), ny))
     if problem.consistency is not None:
         c, jacobian = problem.consistency(values)
         if not (c > 0).all():
@@ -232,7 +234,7 @@ def evaluate(
     problem.evaluations += 1
     simulated = side_by_side(
         lambda i: simulate_sensitive(problem, i, values, motions[i], horizon),
-        range(len(problem.trials)),
+        range(len(problem.data_sets)),
     )
     for i, (n, normal, _, _) in enumerate(simulated):
         m2 = len(motions[i])
@@ -269,7 +271,7 @@ def _together(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Curvature, coupling to the k shared unknowns and gradient of a block."""
     d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
-    for i, place in zip(block.trials, block.places, strict=True):
+    for i, place in zip(block.data_sets, block.places, strict=True):
         d[np.ix_(place, place)] += own[i][0]
         e[place] += own[i][1]
         g[place] += own[i][2]
@@ -284,15 +286,15 @@ def simulate_sensitive(
     horizon: float,
     keep: bool = False,
 ) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
-    """One trial: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
+    """One data set: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
 
-    Columns: what the trial has of its own, then the shared values (not coordinates).
+    Columns: what the data set has of its own, then the shared values (not coordinates).
     """
-    trial, compiled, u = problem.trials[i], problem.compiled[i], problem.inputs[i]
+    data_set, compiled, u = problem.data_sets[i], problem.compiled[i], problem.inputs[i]
     p = problem.vectors[i].copy()
     p[problem.places[i]] = values
     p[problem.own_places[i]] = own_values(problem.own, motion)
-    n = int(np.searchsorted(trial.time, horizon, side='right'))
+    n = int(np.searchsorted(data_set.time, horizon, side='right'))
     start = problem.starts[i]
     x0, by_start, by_free = compiled.initial_sensitivity(motion[start], u[0], p)
     s0 = np.zeros((compiled.nx, len(motion) + len(values)))
@@ -301,9 +303,17 @@ def simulate_sensitive(
         if column >= 0:
             s0[:, column] = by_free[:, f]
     normal, y, jacobian = compiled.normal(
-        trial.time[:n], u[:n], x0, s0, p, problem.columns[i], trial.outputs[:n], 1 / trial.sigma,
-        keep=keep, refinement=problem.refinement,
-    )  # fmt: skip
+        data_set.time[:n],
+        u[:n],
+        x0,
+        s0,
+        p,
+        problem.columns[i],
+        data_set.outputs[:n],
+        1 / data_set.sigma,
+        keep=keep,
+        refinement=problem.refinement,
+    )
     return n, normal, y, jacobian
 
 
@@ -313,17 +323,17 @@ def moved(
     factors: Sequence[np.ndarray],
     step: np.ndarray,
 ) -> list[np.ndarray]:
-    """What each trial has of its own after a step of the shared unknowns (`reduced`)."""
+    """What each data set has of its own after a step of the shared unknowns (`reduced`)."""
     found = list(motions)
     for block, solved in zip(problem.blocks, factors, strict=True):
         move = -(solved[:, -1] + solved[:, :-1] @ step)
-        for i, place in zip(block.trials, block.places, strict=True):
+        for i, place in zip(block.data_sets, block.places, strict=True):
             found[i] = motions[i] + move[place]
     return found
 
 
 def own_values(own: Sequence[Unknown], motion: np.ndarray) -> np.ndarray:
-    """Of what a trial has of its own, the values behind the initial motion, within range."""
+    """Of what a data set has of its own, the values behind the initial motion, within range."""
     values = motion[len(motion) - len(own) :]
     return np.clip(values, [u.lower for u in own], [u.upper for u in own])
 

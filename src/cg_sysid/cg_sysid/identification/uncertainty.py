@@ -21,7 +21,7 @@ def uncertainty(
 
     Returns:
         Covariance of the coordinates (k, k), the share of each that comes from data (k,), and
-        the standard deviations of what each trial has of its own behind its initial motion: how
+        the standard deviations of what each data set has of its own behind its initial motion: how
         far extra states are from settled, and its own values.
 
     Two estimates, and the larger one counts: the curvature scaled by the size of the residual,
@@ -66,7 +66,7 @@ def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarra
 def _own_sigmas(
     problem: Problem, point: Point, covariance: np.ndarray, rescale: float
 ) -> tuple[np.ndarray, ...]:
-    """Standard deviation of each trial's own values, what is shared being uncertain too."""
+    """Standard deviation of each data set's own values, what is shared being uncertain too."""
     found = list(_unknown(problem))
     if not any(map(len, found)):
         return tuple(found)
@@ -75,15 +75,15 @@ def _own_sigmas(
         moved = solve(own, cross)
         spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
         sigmas = np.sqrt(np.maximum(np.diag(spread), 0.0))
-        for i, place in zip(block.trials, block.places, strict=True):
-            found[i] = sigmas[place][len(problem.trials[i].motion) :]
+        for i, place in zip(block.data_sets, block.places, strict=True):
+            found[i] = sigmas[place][len(problem.data_sets[i].motion) :]
     return tuple(found)
 
 
 def _unknown(problem: Problem) -> tuple[np.ndarray, ...]:
     return tuple(
-        np.zeros(len(guess) - len(trial.motion))
-        for guess, trial in zip(problem.guesses, problem.trials, strict=True)
+        np.zeros(len(guess) - len(data_set.motion))
+        for guess, data_set in zip(problem.guesses, problem.data_sets, strict=True)
     )
 
 
@@ -111,18 +111,18 @@ def _block_scores(
     values = problem.values(theta)
     chain = problem.chain(values)
     blocks = []
-    # What moves of each trial's own with what is shared, shape (own, k).
+    # What moves of each data set's own with what is shared, shape (own, k).
     follows: dict[int, np.ndarray] = {}
     for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
         solved = solve(own, cross)
-        follows |= {i: solved[p] for i, p in zip(block.trials, block.places, strict=True)}
-    for i, trial in enumerate(problem.trials):
+        follows |= {i: solved[p] for i, p in zip(block.data_sets, block.places, strict=True)}
+    for i, data_set in enumerate(problem.data_sets):
         n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
         assert y is not None
         assert jacobian is not None
-        residual = np.nan_to_num((y - trial.outputs[:n]) / trial.sigma**2) * weight
+        residual = np.nan_to_num((y - data_set.outputs[:n]) / data_set.sigma**2) * weight
         rows = np.einsum('kj,kjc->kc', residual, jacobian)
-        edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(trial.time[n - 1], 1e-9))))
+        edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(data_set.time[n - 1], 1e-9))))
         sums = np.add.reduceat(rows, edges, axis=0)
         m2 = len(motions[i])
         blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ follows[i])

@@ -26,7 +26,7 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
-from cg_sysid.identification.data_set import Trial, measured_motion, prepare
+from cg_sysid.identification.data_set import DataSet, measured_motion, prepare
 from cg_sysid.records.record import Record
 
 # A model that is right to one per cent, which is as right as an identified one is, is wrong by the
@@ -85,7 +85,8 @@ class Windows:
             return 'every record is fitted and judged whole'
         told = '; '.join(
             f'{f.name} in {len(f.cuts) + 1} windows, as an error at its start '
-            f'grows {_times(f.growth)}' for f in lost
+            f'grows {_times(f.growth)}'
+            for f in lost
         )
         others = len(self.records) - len(lost)
         rest = f', the other {others} whole' if others else ''
@@ -104,7 +105,7 @@ def _times(growth: float) -> str:
 def followed(model: Model, records: Sequence[Record]) -> tuple[Followed, ...]:
     """How far each record is followed along a model; to its end if the model cannot say."""
     return tuple(
-        _followed(model, trial) for trial in (prepare(model, records) if records else ())
+        _followed(model, data_set) for data_set in (prepare(model, records) if records else ())
     )
 
 
@@ -116,12 +117,12 @@ def windows_of(record: Record, found: Followed) -> list[Record]:
     return [record.slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
-def _followed(model: Model, trial: Trial) -> Followed:
+def _followed(model: Model, data_set: DataSet) -> Followed:
     try:
-        begins, maps = sensitivities(model, trial)
+        begins, maps = sensitivities(model, data_set)
     except DynamicsError:
-        return Followed(trial.name, 1.0)
-    since_start = since_cut = np.eye(len(trial.motion))
+        return Followed(data_set.name, 1.0)
+    since_start = since_cut = np.eye(len(data_set.motion))
     largest, cuts, last = 1.0, [], 0.0
     for begin, phi in zip(begins, maps, strict=True):
         with np.errstate(over='ignore', invalid='ignore'):
@@ -130,37 +131,37 @@ def _followed(model: Model, trial: Trial) -> Followed:
         if _norm(since_cut) > FOLLOWED and begin - last >= SHORTEST_WINDOW:
             cuts.append(float(begin))
             since_cut, last = phi, float(begin)
-    if cuts and trial.duration - cuts[-1] < SHORTEST_WINDOW:
+    if cuts and data_set.duration - cuts[-1] < SHORTEST_WINDOW:
         cuts.pop()
-    return Followed(trial.name, largest, tuple(cuts))
+    return Followed(data_set.name, largest, tuple(cuts))
 
 
 def _norm(phi: np.ndarray) -> float:
     return float(np.linalg.norm(phi, 2)) if np.isfinite(phi).all() else math.inf
 
 
-def sensitivities(model: Model, trial: Trial) -> tuple[np.ndarray, list[np.ndarray]]:
-    """When each piece of a trial begins, in s, shape (k,), and its D Phi D^-1, (2m, 2m) each.
+def sensitivities(model: Model, data_set: DataSet) -> tuple[np.ndarray, list[np.ndarray]]:
+    """When each piece of a data set begins, in s, shape (k,), and its D Phi D^-1, (2m, 2m) each.
 
     Extra states of a model start settled in every piece.
 
     Raises:
         SimulationError: if the model runs away within a piece.
     """
-    body, time = model.mechanism, trial.time
-    compiled = compile_model(model, trial.setup)
-    p = parameter_vector(model, trial.setup)
-    u = trial.inputs_for(compiled.input_names)
-    edges = np.searchsorted(time, np.arange(0.0, trial.duration - PIECE_S / 2, PIECE_S))
+    body, time = model.mechanism, data_set.time
+    compiled = compile_model(model, data_set.setup)
+    p = parameter_vector(model, data_set.setup)
+    u = data_set.inputs_for(compiled.input_names)
+    edges = np.searchsorted(time, np.arange(0.0, data_set.duration - PIECE_S / 2, PIECE_S))
     starts, motions = [], []
     for a in np.unique(edges):
         rows = slice(a, np.searchsorted(time, time[a] + PIECE_S, side='right'))
-        if np.isfinite(trial.outputs[rows]).sum(axis=0).max() < FEWEST:
+        if np.isfinite(data_set.outputs[rows]).sum(axis=0).max() < FEWEST:
             continue  # samples are missing there: the piece before goes on
         starts.append(a)
         motions.append(
             measured_motion(
-                body, trial.setup, time[rows] - time[a], trial.outputs[rows], trial.sigma
+                body, data_set.setup, time[rows] - time[a], data_set.outputs[rows], data_set.sigma
             )[0]
         )
     found = []

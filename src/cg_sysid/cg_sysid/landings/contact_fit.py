@@ -138,9 +138,7 @@ def _fit(fitter: '_Fitter', task: ContactTask) -> ContactFit | str:
     both = [*states, *held]
     passages = (*task.train, *task.held)
     found = [fitter.unpacked(p, s) for p, s in zip(passages, both, strict=True)]
-    belief = sum(
-        0.0 if s is None else float(s.residual[-OWN:] @ s.residual[-OWN:]) for s in both
-    )
+    belief = sum(0.0 if s is None else float(s.residual[-OWN:] @ s.residual[-OWN:]) for s in both)
     return ContactFit(
         task.effects, fitter.law(theta), values, tuple(found),
         tuple(p.centre if s is None else s.own for p, s in zip(passages, both, strict=True)),
@@ -173,9 +171,7 @@ class _Fitter:
             for name, v in zip(self.task.effects, values, strict=True)
         ])  # fmt: skip
 
-    def residual(
-        self, theta: np.ndarray, passage: Passage, own: np.ndarray
-    ) -> np.ndarray | None:
+    def residual(self, theta: np.ndarray, passage: Passage, own: np.ndarray) -> np.ndarray | None:
         """Residuals over noise, those of the belief last; None where it runs away."""
         if not (np.abs(own - passage.centre) < FARTHEST).all():
             return None
@@ -194,7 +190,10 @@ class _Fitter:
         return np.where(np.isfinite(passage.outputs), r, np.nan)
 
     def settle(
-        self, theta: np.ndarray, passage: Passage, own: np.ndarray | None = None,
+        self,
+        theta: np.ndarray,
+        passage: Passage,
+        own: np.ndarray | None = None,
         iterations: int = 8,
     ) -> _State | None:
         """A landing at a given law, its own unknowns fitted."""
@@ -274,9 +273,7 @@ class _Fitter:
         best = int(np.argmin(costs))
         return points[best] if math.isfinite(costs[best]) else None
 
-    def minimise(
-        self, theta: np.ndarray
-    ) -> tuple[np.ndarray, list[_State | None], bool]:
+    def minimise(self, theta: np.ndarray) -> tuple[np.ndarray, list[_State | None], bool]:
         """Law and own unknowns of the training landings together."""
         train = self.task.train
         states = [self.settled(theta, p) for p in train]
@@ -328,9 +325,7 @@ class _Fitter:
                 solved.append(np.zeros((OWN, k + 1)))
                 continue
             h, e, d, shared_g, own_g = self.blocks(theta, passage, state)
-            part = np.linalg.solve(
-                d + damping * np.diag(np.diag(d)), np.column_stack([e, own_g])
-            )
+            part = np.linalg.solve(d + damping * np.diag(np.diag(d)), np.column_stack([e, own_g]))
             H += h - e.T @ part[:, :-1]
             g += shared_g - e.T @ part[:, -1]
             solved.append(part)
@@ -345,9 +340,7 @@ class _Fitter:
         r = state.residual
         return shared.T @ shared, own.T @ shared, own.T @ own, shared.T @ r, own.T @ r
 
-    def uncertainty(
-        self, theta: np.ndarray, states: Sequence[_State | None]
-    ) -> np.ndarray:
+    def uncertainty(self, theta: np.ndarray, states: Sequence[_State | None]) -> np.ndarray:
         """Standard deviation of each coordinate: theory.md, (COV), a block for each landing."""
         if not len(theta):
             return np.zeros(0)

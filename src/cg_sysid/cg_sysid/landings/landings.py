@@ -18,7 +18,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model
 from cg_dynamics.walking.hybrid import Walk, WalkOptions, swing_foot, walk
-from cg_sysid.identification.data_set import as_trial
+from cg_sysid.identification.data_set import as_data_set
 from cg_sysid.records.record import NS_PER_S
 from cg_sysid.stances.phases import Landing
 
@@ -93,7 +93,7 @@ def _ready(model: Model, landing: Landing, sigma: np.ndarray) -> Passage | None:
     lead = record.slice(first, origin)
     lead = replace(lead, setup=replace(record.setup, stance=touchdown.stance))
     ahead = float(record.stamp_ns[rows][0] - lead.stamp_ns[0]) / NS_PER_S
-    motion = _motion(model, as_trial(model.mechanism, lead, sigma), ahead)
+    motion = _motion(model, as_data_set(model.mechanism, lead, sigma), ahead)
     if motion is None:
         return None
     start, covariance = motion
@@ -105,7 +105,8 @@ def _ready(model: Model, landing: Landing, sigma: np.ndarray) -> Passage | None:
     whole[:4, :4] = covariance + np.diag(MOTION_SIGMA**2)
     whole[4, 4] = SLOPE_SIGMA**2
     late = compile_model(model, Setup(stance=touchdown.stance)).delays(
-        parameter_vector(model, Setup()))[0]
+        parameter_vector(model, Setup())
+    )[0]
     known = (time >= begin - late - STEP_S) & (time < stop)
     reach, _ = swing_foot(start[:2], touchdown.stance, model.values['leg_length'])
     return Passage(
@@ -123,24 +124,24 @@ def _ready(model: Model, landing: Landing, sigma: np.ndarray) -> Passage | None:
     )
 
 
-def _motion(model: Model, trial, after: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """State at the end of a trial, from a fit of its start, and the covariance of its motion."""
-    compiled, p = compile_model(model, trial.setup), parameter_vector(model, trial.setup)
-    u = trial.inputs_for(compiled.input_names)
+def _motion(model: Model, data_set, after: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """State at the end of a data set, by a fit of its start, and the covariance of its motion."""
+    compiled, p = compile_model(model, data_set.setup), parameter_vector(model, data_set.setup)
+    u = data_set.inputs_for(compiled.input_names)
     none = np.full(len(compiled.free), -1)
-    motion, belief = trial.motion, np.diag(1 / trial.motion_sigma**2)
+    motion, belief = data_set.motion, np.diag(1 / data_set.motion_sigma**2)
     for _ in range(4):
         x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
         normal, _, _ = compiled.normal(
-            trial.time, u, x0, by_motion, p, none, trial.outputs, 1 / trial.sigma
+            data_set.time, u, x0, by_motion, p, none, data_set.outputs, 1 / data_set.sigma
         )
-        if normal.rows < len(trial.time) or not np.isfinite(normal.hessian).all():
+        if normal.rows < len(data_set.time) or not np.isfinite(normal.hessian).all():
             return None
-        away = trial.motion - motion
+        away = data_set.motion - motion
         information = normal.hessian + belief
         motion = motion - np.linalg.solve(information, normal.gradient - belief @ away)
-    # One row more, at which the trial ends.
-    time, inputs = np.append(trial.time, after), np.vstack([u, u[-1:]])
+    # One row more, at which the data set ends.
+    time, inputs = np.append(data_set.time, after), np.vstack([u, u[-1:]])
 
     def end(start: np.ndarray) -> np.ndarray:
         x0 = compiled.initial_state(start, u[0], p)
@@ -186,9 +187,7 @@ def simulate_passage(
     return _outputs(compiled, p, done, passage)
 
 
-def _outputs(
-    compiled: CompiledModel, p: np.ndarray, done: Walk, passage: Passage
-) -> np.ndarray:
+def _outputs(compiled: CompiledModel, p: np.ndarray, done: Walk, passage: Passage) -> np.ndarray:
     _, delays, _ = compiled.delays(p)
     time = np.concatenate([arc.time for arc in done.arcs])
     states = np.concatenate([arc.states for arc in done.arcs])
@@ -213,8 +212,9 @@ def _between(time: np.ndarray, states: np.ndarray, at: np.ndarray) -> np.ndarray
     x = a + s * (b - a)
     d0, d1 = a[:, 2:4], b[:, 2:4]
     rise = b[:, :2] - a[:, :2]
-    inside = a[:, :2] + s * (h * d0 + s * (3 * rise - h * (2 * d0 + d1)
-                                           + s * (h * (d0 + d1) - 2 * rise)))
+    inside = a[:, :2] + s * (
+        h * d0 + s * (3 * rise - h * (2 * d0 + d1) + s * (h * (d0 + d1) - 2 * rise))
+    )
     # Before the start the robot moved on straight.
     x[:, :2] = np.where(s < 0, a[:, :2] + s * h * d0, inside)
     return x

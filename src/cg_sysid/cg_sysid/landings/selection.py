@@ -187,8 +187,9 @@ def _judged(
     if significance < SIGNIFICANT or held_gain <= 0:
         reasons.append('no significant gain on landings held out')
     elif explained < NOTICEABLE:
-        reasons.append(f'explains {explained:.2f} noise standard deviations, '
-                       f'{NOTICEABLE:g} needed')
+        reasons.append(
+            f'explains {explained:.2f} noise standard deviations, {NOTICEABLE:g} needed'
+        )
     left = max(errors[1] - 1, 0.0)
     if left > LEFT * max(was[1] - 1, 0.0) and errors[1] > AT_NOISE:
         reasons.append(f'leaves an error of {np.sqrt(errors[1]):.1f} noise standard deviations')

@@ -17,15 +17,15 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.effects.unmodelled import COSINES, LearnedEffect
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
-from cg_sysid.identification.identify import Fit, fit, in_trial, score
+from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.identify import Fit, fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, without_events
 from cg_sysid.learned.linear_response import cut, pieces_of, simulated_signals
 from cg_sysid.learned.residual_terms import BEYOND, Sketches, Term
 from cg_sysid.learned.shape import GRID, function_of, shape_of
 from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search.candidates import Outcome, Task, chi2, try_candidate
-from cg_sysid.search.model_selection import Contest, Jury, share_explained
+from cg_sysid.search.model_selection import Comparison, ModelSelection, share_explained
 
 FINALISTS = 4
 WORTH_FITTING = 8.0  # times the best sketch's error above the noise
@@ -42,18 +42,18 @@ WORSE = 3.0  # times the error on windows that a fit of whole records may leave
 OUT_OF_RANGE = 0.15  # share of the range of its variable by which a function may miss it
 
 Run = Callable[[Callable, list[tuple], str], list]
-Sides = tuple[Sequence[Trial], Sequence[Trial]]
+Sides = tuple[Sequence[DataSet], Sequence[DataSet]]
 
 
 def characterise(
-    base: Outcome, train: Sequence[Trial], held: Sequence[Trial], run: Run
+    base: Outcome, train: Sequence[DataSet], held: Sequence[DataSet], run: Run
 ) -> Unmodelled | None:
     """The learned term that explains best what a model leaves; None if none is significant.
 
     Args:
         base: The model as far as it is known, fitted.
-        train: Trials to learn from.
-        held: Trials that judge.
+        train: Data sets to learn from.
+        held: Data sets that judge.
         run: Calls a function with each tuple of arguments, in parallel perhaps, and tells people
             what for.
     """
@@ -74,8 +74,8 @@ def what_remains(
     nominal: Outcome,
     final: Outcome,
     causes: Collection[str],
-    train: Sequence[Trial],
-    held: Sequence[Trial],
+    train: Sequence[DataSet],
+    held: Sequence[DataSet],
     run: Run,
 ) -> tuple[Unmodelled | None, bool]:
     """What a model with causes leaves, as a learned term, and whether the causes stand.
@@ -88,8 +88,8 @@ def what_remains(
         nominal: The model without causes, fitted.
         final: The model with them.
         causes: Their labels.
-        train: Trials to learn from.
-        held: Trials that judge.
+        train: Data sets to learn from.
+        held: Data sets that judge.
         run: As in `characterise`.
     """
     beside = characterise(final, train, held, run)
@@ -126,22 +126,24 @@ def _causes_stand(final: Outcome, alone: Unmodelled, beside: Unmodelled, sides: 
 
 
 def _above_noise(
-    final: Outcome, alone: Unmodelled, beside: Unmodelled, held: int, trials: Sequence[Trial]
+    final: Outcome, alone: Unmodelled, beside: Unmodelled, held: int, data_sets: Sequence[DataSet]
 ) -> tuple[float, float, float]:
-    """What causes, a term alone and both leave of training (0) or held-out trials (1)."""
+    """What causes, a term alone and both leave of training (0) or held-out data sets (1)."""
     if alone.window is None:
         whole = (final.train, final.held), (alone.fit, alone.held), (beside.fit, beside.held)
         fits = [pair[held] or pair[0] for pair in whole]
     else:
         length = min(u.window or LONGEST_WINDOW for u in (alone, beside))
-        windows = [window for t in trials for window in cut(beside.fit.model, t, length)]
+        windows = [window for t in data_sets for window in cut(beside.fit.model, t, length)]
         models = (final.train.model, alone.fit.model, beside.fit.model)
         fits = [score(without_events(model), windows) for model in models]
     causes, term, both = (max(fit.normalised_error - 1, NEGLIGIBLE) for fit in fits)
     return causes, term, both
 
 
-def sketch(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> tuple[float, list[Term]]:
+def sketch(
+    task: Task, train: Sequence[DataSet], held: Sequence[DataSet]
+) -> tuple[float, list[Term]]:
     """Length of a piece in s, and the terms that are worth a fit, best first."""
     pieces = pieces_of(task.model, train, held, task.bounds)
     if len({piece.held for piece in pieces.all}) < 2:
@@ -166,21 +168,21 @@ def _smooth_or_periodic(
     base: Outcome, lasting: Task, terms: Sequence[Term], window: float, sides: Sides, run: Run
 ) -> Unmodelled | None:
     windows = tuple(
-        [w for trial in side for w in cut(lasting.model, trial, window)] for side in sides
+        [w for data_set in side for w in cut(lasting.model, data_set, window)] for side in sides
     )
     most = max(2, int(LEARNING_S / window))
     windows = tuple([w for w in side][:: max(1, -(-len(side) // most))] for side in windows)
     tasks = [lasting, *(replace(lasting, model=t.added_to(lasting.model)) for t in terms)]
-    contest = _contest(tasks, [term.label for term in terms], windows, run)
-    if contest is None or contest.ranked[0][0].reason:
+    comparison = _compare(tasks, [term.label for term in terms], windows, run)
+    if comparison is None or comparison.ranked[0][0].reason:
         return None
-    label = contest.ranked[0][0].label
-    found = contest.ranked[0][1]
+    label = comparison.ranked[0][0].label
+    found = comparison.ranked[0][1]
     effect = _learned(found, label)
     variable = _variable(effect, found, windows)
     other_range = _over(variable, effect, found)
     if other_range is not None:
-        again = _contest([tasks[0], other_range], [label], windows, run)
+        again = _compare([tasks[0], other_range], [label], windows, run)
         if again is not None and chi2(again.ranked[0][1]) < chi2(found):
             found = again.ranked[0][1]
             variable = _variable(effect, found, windows)
@@ -190,10 +192,10 @@ def _smooth_or_periodic(
     (whole,) = run(whole_fit, [arguments], f'{label} on whole records')
     good = isinstance(whole, tuple) and _follows_on(whole, found, base)
     fits = whole if good else (found.train, None)
-    return _unmodelled(contest, found, base.held, fits, variable, window)
+    return _unmodelled(comparison, found, base.held, fits, variable, window)
 
 
-def _contest(tasks: Sequence[Task], labels: Sequence[str], sides, run: Run) -> Contest | None:
+def _compare(tasks: Sequence[Task], labels: Sequence[str], sides, run: Run) -> Comparison | None:
     """Learned terms against the model without them, the first task; None if a fit fails."""
     reference, *outcomes = run(try_candidate, [(task, *sides) for task in tasks], 'learned terms')
     good = [
@@ -203,17 +205,17 @@ def _contest(tasks: Sequence[Task], labels: Sequence[str], sides, run: Run) -> C
     ]
     if not isinstance(reference, Outcome) or not good:
         return None
-    contest = Jury(*sides).contest(reference, good)
+    comparison = ModelSelection(*sides).comparison(reference, good)
     # Those that may be accepted first.
-    ranked = sorted(contest.ranked, key=lambda pair: bool(pair[0].reason))
-    return replace(contest, ranked=tuple(ranked))
+    ranked = sorted(comparison.ranked, key=lambda pair: bool(pair[0].reason))
+    return replace(comparison, ranked=tuple(ranked))
 
 
 def _weighed(o: Outcome, label: str) -> Outcome:
     """The outcome under the term's name, its coefficients counted by what data say about them."""
     own = [u.name.startswith(f'{label}.') for u in o.train.unknowns]
-    by_belief = sum(own) - float(o.train.information[own].sum())
-    return replace(o, label=label, unknowns=o.unknowns - round(by_belief))
+    by_prior = sum(own) - float(o.train.information[own].sum())
+    return replace(o, label=label, unknowns=o.unknowns - round(by_prior))
 
 
 def _learned(o: Outcome, label: str) -> LearnedEffect:
@@ -224,15 +226,15 @@ def _learned(o: Outcome, label: str) -> LearnedEffect:
 
 def _variable(effect: LearnedEffect, found: Outcome, sides) -> np.ndarray:
     """Values that the variable of a term takes along the records, shape (n,)."""
-    trials = [trial for side in sides for trial in side]
+    data_sets = [data_set for side in sides for data_set in side]
     if effect.variable == 'time':
-        return np.concatenate([trial.inputs_for((TIME,))[:, 0] for trial in trials])
+        return np.concatenate([data_set.inputs_for((TIME,))[:, 0] for data_set in data_sets])
     motions = (*found.train.motions, *found.held.motions)
     return np.concatenate(
         [
-            simulated_signals(model, trial, motion)[effect.follows]
-            for trial, (model, motion) in zip(
-                trials, (in_trial(found.train.model, own) for own in motions), strict=True
+            simulated_signals(model, data_set, motion)[effect.follows]
+            for data_set, (model, motion) in zip(
+                data_sets, (in_data_set(found.train.model, own) for own in motions), strict=True
             )
         ]
     )
@@ -271,8 +273,8 @@ def whole_fit(
     task: Task,
     at: Mapping[str, float],
     own: Mapping[str, Mapping[str, float]],
-    train: Sequence[Trial],
-    held: Sequence[Trial],
+    train: Sequence[DataSet],
+    held: Sequence[DataSet],
 ) -> tuple[Fit, Fit] | str:
     """Fit of whole records from given values on, and score of those held out; or why not."""
     try:
@@ -291,7 +293,7 @@ def _follows_on(whole: tuple[Fit, Fit], found: Outcome, base: Outcome) -> bool:
 
 
 def _unmodelled(
-    contest: Contest,
+    comparison: Comparison,
     found: Outcome,
     before: Fit,
     fits: tuple[Fit, Fit | None],
@@ -299,7 +301,7 @@ def _unmodelled(
     window: float | None,
 ) -> Unmodelled:
     """The answer, where whole records were scored as `before` without the term."""
-    best = contest.ranked[0][0]
+    best = comparison.ranked[0][0]
     effect = _learned(found, best.label)
     return Unmodelled(
         effect=effect,
@@ -311,13 +313,13 @@ def _unmodelled(
         explained=(
             share_explained(before, fits[1])
             if fits[1] is not None
-            else share_explained(contest.base.held, found.held)
+            else share_explained(comparison.base.held, found.held)
         ),
         window=window,
         rivals=tuple(
             _learned(o, c.label)
-            for c, o in contest.ranked[1:]
-            if not c.reason and c.evidence > best.evidence - contest.margin
+            for c, o in comparison.ranked[1:]
+            if not c.reason and c.evidence > best.evidence - comparison.margin
         ),
         fit=fits[0],
         held=fits[1],
@@ -338,23 +340,23 @@ def _vibrating(base: Outcome, term: Term, sides: Sides, run: Run) -> Unmodelled 
     """Judged on whole records: a phase of each window's own would explain anything."""
     model = term.added_to(base.model)
     tasks = [
-        replace(base.task, model=base.model, effect=None, events=base.events, leads=()),
-        replace(base.task, model=model, effect=None, events=base.events, leads=()),
+        replace(base.task, model=base.model, effect=None, events=base.events, warm_starts=()),
+        replace(base.task, model=model, effect=None, events=base.events, warm_starts=()),
     ]
-    contest = _contest(tasks, [term.label], sides, run)
-    if contest is None or contest.ranked[0][0].reason:
+    comparison = _compare(tasks, [term.label], sides, run)
+    if comparison is None or comparison.ranked[0][0].reason:
         return None
-    found = contest.ranked[0][1]
+    found = comparison.ranked[0][1]
     effect = _learned(found, term.label)
     names = [f'{term.label}.{name}' for name in effect.coefficients]
     waves = {
-        trial: np.array([own[name] for name in names]) for trial, own in found.events.items()
+        data_set: np.array([own[name] for name in names]) for data_set, own in found.events.items()
     }
     strongest = max(waves.values(), key=lambda own: float(np.hypot(own[0], own[1])))
     values = {n: float(v) for n, v in zip(names, strongest, strict=True)}
-    time = np.concatenate([trial.time for side in sides for trial in side])
+    time = np.concatenate([data_set.time for side in sides for data_set in side])
     shown = replace(found.train, model=found.train.model.with_values(values))
-    made = _unmodelled(contest, found, base.held, (shown, found.held), time, None)
+    made = _unmodelled(comparison, found, base.held, (shown, found.held), time, None)
     rms = float(np.sqrt(np.mean([own @ own / 2 for own in waves.values()])))
     return replace(
         made,

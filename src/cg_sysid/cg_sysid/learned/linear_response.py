@@ -22,8 +22,8 @@ from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model
-from cg_sysid.identification.data_set import Trial, initial_motion
-from cg_sysid.identification.identify import fit, in_trial, score
+from cg_sysid.identification.data_set import DataSet, initial_motion
+from cg_sysid.identification.identify import fit, in_data_set, score
 from cg_sysid.identification.unknowns import Unknown, awake
 
 PIECES_S = (0.5, 0.2, 0.1, 0.05)
@@ -104,8 +104,8 @@ class Pieces:
 
 def pieces_of(
     model: Model,
-    train: Sequence[Trial],
-    held: Sequence[Trial],
+    train: Sequence[DataSet],
+    held: Sequence[DataSet],
     bounds: Mapping[str, float] | None = None,
 ) -> Pieces:
     """Cut all records into the longest pieces on which the model stays close to them.
@@ -119,9 +119,11 @@ def pieces_of(
     Raises:
         IdentificationError: if the records are too short to be cut.
     """
-    trials = (*train, *held)
+    data_sets = (*train, *held)
     for length in PIECES_S:
-        cuts = [(k, p) for k, trial in enumerate(trials) for p in cut(model, trial, length)]
+        cuts = [
+            (k, p) for k, data_set in enumerate(data_sets) for p in cut(model, data_set, length)
+        ]
         # What a wrong model was fitted to as a whole may be far from the truth.
         probe = fit(model, [piece for _, piece in cuts[::PROBED]], bounds=bounds)
         if probe.normalised_error < CLOSE:
@@ -142,29 +144,29 @@ def pieces_of(
     return Pieces(tuple(found), probe.model, probe.unknowns, length)
 
 
-def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
-    """Pieces of a trial, of about so many seconds; the time of the record goes on in them."""
-    count = max(1, round(trial.duration / length))
-    edges = np.searchsorted(trial.time, np.linspace(0, trial.duration, count + 1))
-    edges[-1] = len(trial.time)
-    names = (*trial.input_names, *CLOCKS)
-    inputs = trial.inputs_for(names)
+def cut(model: Model, data_set: DataSet, length: float) -> list[DataSet]:
+    """Pieces of a data set, of about so many seconds; the time of the record goes on in them."""
+    count = max(1, round(data_set.duration / length))
+    edges = np.searchsorted(data_set.time, np.linspace(0, data_set.duration, count + 1))
+    edges[-1] = len(data_set.time)
+    names = (*data_set.input_names, *CLOCKS)
+    inputs = data_set.inputs_for(names)
     found = []
-    recorded = np.isfinite(trial.outputs).any(axis=0)
+    recorded = np.isfinite(data_set.outputs).any(axis=0)
     for a, b in pairwise(edges):
         # A piece begins where it is first seen.
-        a += int(np.argmax(np.isfinite(trial.outputs[a:b]).any(axis=1)))
-        time, outputs = trial.time[a:b] - trial.time[a], trial.outputs[a:b]
+        a += int(np.argmax(np.isfinite(data_set.outputs[a:b]).any(axis=1)))
+        time, outputs = data_set.time[a:b] - data_set.time[a], data_set.outputs[a:b]
         if (np.isfinite(outputs).sum(axis=0)[recorded] < FEWEST).any():
             continue
         motion, spread = initial_motion(
-            model.mechanism, trial.setup, time, outputs, trial.sigma
+            model.mechanism, data_set.setup, time, outputs, data_set.sigma
         )
         # Where a sensor is wrong, so is what it says about the start of every piece.
         loose = np.repeat((LOOSE_RAD, LOOSE_RAD_S), len(motion) // 2)
         found.append(
             replace(
-                trial, time=time, inputs=inputs[a:b], input_names=names,
+                data_set, time=time, inputs=inputs[a:b], input_names=names,
                 outputs=outputs, motion=motion,
                 motion_sigma=np.maximum(spread, loose),
             )
@@ -175,9 +177,7 @@ def cut(model: Model, trial: Trial, length: float) -> list[Trial]:
 class _Linear:
     """The symbolic derivatives of one compiled structure."""
 
-    def __init__(
-        self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup
-    ):
+    def __init__(self, model: Model, compiled: CompiledModel, names: Sequence[str], setup: Setup):
         self.model, self.compiled, self.names = model, compiled, list(names)
         e = compiled.equations
         basis = model.mechanism.kinematics(setup).basis
@@ -190,10 +190,10 @@ class _Linear:
         )  # fmt: skip
         self.m = e.coordinates
 
-    def piece(self, piece: Trial, motion: np.ndarray, record: int, held: bool) -> Piece | None:
+    def piece(self, piece: DataSet, motion: np.ndarray, record: int, held: bool) -> Piece | None:
         """One piece from what it has of its own; None where sensitivities run away."""
         compiled, m, names = self.compiled, self.m, self.names
-        model, motion = in_trial(self.model, motion)
+        model, motion = in_data_set(self.model, motion)
         p = parameter_vector(model, piece.setup)
         u = piece.inputs_for(compiled.input_names)
         n, nx = len(piece.time), compiled.nx
@@ -261,7 +261,7 @@ class _Linear:
             found[k + 1, :, :, slot[k]] += kick[k]
         return found.reshape(n, nx, -1)
 
-    def _samples(self, piece: Trial) -> tuple[np.ndarray, np.ndarray]:
+    def _samples(self, piece: DataSet) -> tuple[np.ndarray, np.ndarray]:
         """Rows and outputs of the samples that count."""
         rows, outputs = [], []
         for j, channel in enumerate(piece.outputs.T):
@@ -273,20 +273,22 @@ class _Linear:
         return np.concatenate(rows), np.concatenate(outputs)
 
 
-def simulated_signals(model: Model, trial: Trial, motion: np.ndarray) -> dict[str, np.ndarray]:
-    """`signals_of` along a trial that a model simulates from an initial motion, (2m,)."""
-    compiled, p = compile_model(model, trial.setup), parameter_vector(model, trial.setup)
-    u = trial.inputs_for(compiled.input_names)
-    states = compiled.simulate(trial.time, u, compiled.initial_state(motion, u[0], p), p)
-    return signals_of(model, trial, states)
+def simulated_signals(
+    model: Model, data_set: DataSet, motion: np.ndarray
+) -> dict[str, np.ndarray]:
+    """`signals_of` along a data set that a model simulates from an initial motion, (2m,)."""
+    compiled, p = compile_model(model, data_set.setup), parameter_vector(model, data_set.setup)
+    u = data_set.inputs_for(compiled.input_names)
+    states = compiled.simulate(data_set.time, u, compiled.initial_state(motion, u[0], p), p)
+    return signals_of(model, data_set, states)
 
 
-def signals_of(model: Model, trial: Trial, states: np.ndarray) -> dict[str, np.ndarray]:
+def signals_of(model: Model, data_set: DataSet, states: np.ndarray) -> dict[str, np.ndarray]:
     """What a torque or an error may follow, by the names of `LearnedEffect.follows`.
 
     Args:
         model: The model.
-        trial: The record.
+        data_set: The record.
         states: What was simulated along it, shape (n, nx).
 
     Returns:
@@ -294,19 +296,19 @@ def signals_of(model: Model, trial: Trial, states: np.ndarray) -> dict[str, np.n
         of the legs of a compass gait and of what ideal sensors report, and the time.
     """
     body = model.mechanism
-    basis = np.asarray(ca.DM(body.kinematics(trial.setup).basis), float)
+    basis = np.asarray(ca.DM(body.kinematics(data_set.setup).basis), float)
     m = basis.shape[1]
     q, v = states[:, :m] @ basis.T, states[:, m : 2 * m] @ basis.T
     rows = {name: np.eye(len(body.coordinates))[i] for i, name in enumerate(body.coordinates)}
     rows |= {joint: np.array(row) for joint, row in body.joints.items()}
     if body.name == 'compass_gait':
         rows |= {leg: np.eye(2)[i] for i, leg in enumerate(body.bodies)}
-        rows['stance'] = rows[trial.setup.stance]
-    found = {TIME: trial.inputs_for((TIME,))[:, 0]}
+        rows['stance'] = rows[data_set.setup.stance]
+    found = {TIME: data_set.inputs_for((TIME,))[:, 0]}
     for name, row in rows.items():
         found |= {f'angle:{name}': q @ row, f'rate:{name}': v @ row}
     for joint, name in zip(body.joints, body.inputs, strict=True):
-        torque = trial.inputs_for((name,))[:, 0]
+        torque = data_set.inputs_for((name,))[:, 0]
         found |= {f'torque:{joint}': torque, f'torque:{name}': torque}
     symbols = [ca.SX.sym('q', q.shape[1]), ca.SX.sym('v', v.shape[1])]
     ideal = body.sensors(*symbols)

@@ -20,7 +20,7 @@ import numpy as np
 from cg_dynamics.effects import UNMODELLED
 from cg_dynamics.effects.unmodelled import COSINES, JointTerm, LearnedEffect, SensorTerm
 from cg_dynamics.model import Model
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.learned.linear_response import SAMPLES_HZ, Piece, Pieces
 
@@ -66,9 +66,7 @@ class Term:
 
     def added_to(self, model: Model) -> Model:
         """The model with the term in it."""
-        extended = model.with_effect(
-            self.effect.name, self.effect.at, **self.fixed, **self.start
-        )
+        extended = model.with_effect(self.effect.name, self.effect.at, **self.fixed, **self.start)
         quantities = dict(extended.quantities)
         for name, value in self.tolerances.items():
             full = f'{self.label}.{name}'
@@ -81,12 +79,12 @@ class Sketches:
 
     Args:
         pieces: All records in pieces.
-        trials: The records, those to train on first.
+        data_sets: The records, those to train on first.
     """
 
-    def __init__(self, pieces: Pieces, trials: Sequence[Trial]):
+    def __init__(self, pieces: Pieces, data_sets: Sequence[DataSet]):
         unknowns = pieces.unknowns
-        self.trials, self.body = trials, pieces.model.mechanism
+        self.data_sets, self.body = data_sets, pieces.model.mechanism
         values = [pieces.model.values[u.name] for u in unknowns]
         chain = np.array(
             [v if u.logarithmic else 1.0 for u, v in zip(unknowns, values, strict=True)]
@@ -127,7 +125,7 @@ class Sketches:
         return sorted(found, key=lambda term: term.error)
 
     def _effects(self) -> Iterator[LearnedEffect]:
-        stances = {trial.setup.stance for trial in self.trials}
+        stances = {data_set.setup.stance for data_set in self.data_sets}
         for cls in UNMODELLED.values():
             for site in cls.sites(self.body):
                 # With one leg always standing, "the leg that stands" is another name for it.
@@ -154,7 +152,7 @@ class Sketches:
         if isinstance(effect, JointTerm):
             row = np.array(self.body.joints[place])
             return piece.by_torque(row, self._carrier(effect, piece)[:, None] * basis)
-        leg = self.trials[piece.record].setup.stance if place == 'stance' else place
+        leg = self.data_sets[piece.record].setup.stance if place == 'stance' else place
         return piece.by_torque(np.eye(2)[self.body.bodies.index(leg)], basis)
 
     def _carrier(self, effect: JointTerm, piece: Piece) -> np.ndarray:
@@ -263,7 +261,7 @@ class Sketches:
             return MOST_CYCLES / (2 * np.pi)
         if effect.variable == 'torque':
             return MOST_STEPS / span
-        step = max(float(np.median(np.diff(trial.time))) for trial in self.trials)
+        step = max(float(np.median(np.diff(data_set.time))) for data_set in self.data_sets)
         return min(FASTEST_HZ[isinstance(effect, SensorTerm)], 0.4 / step)
 
     # --- sweeps -------------------------------------------------------------------------------

@@ -100,9 +100,7 @@ def shape_of(effect: LearnedEffect, fit: Fit, variable: np.ndarray) -> Shape:
     )
 
 
-def function_of(
-    effect: LearnedEffect, fit: Fit, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def function_of(effect: LearnedEffect, fit: Fit, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value and standard deviation (BAND) of the function at s, both of its shape (n,)."""
     p = {q.name: ca.SX.sym(q.name) for q in effect.parameters}
     x, stacked = ca.SX.sym('s'), ca.vertcat(*p.values())

@@ -74,9 +74,7 @@ def _cleaned_inputs(
     torque_topic: str | None,
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Input channel -> (stamps, values); empty where no torque can act."""
-    chosen = torque_topic or (
-        APPLIED_TORQUE if APPLIED_TORQUE in raw.topics else TORQUE_COMMAND
-    )
+    chosen = torque_topic or (APPLIED_TORQUE if APPLIED_TORQUE in raw.topics else TORQUE_COMMAND)
     if chosen not in (APPLIED_TORQUE, TORQUE_COMMAND):
         msg = f'torque_topic is {chosen!r}; allowed: {APPLIED_TORQUE}, {TORQUE_COMMAND}'
         raise ValueError(msg)
@@ -95,9 +93,11 @@ def _cleaned_inputs(
         return {**filled, **inputs}
     if setup.fixture == 'legs_tied' and torque_topic is None:
         return inputs  # with the legs tied a hip torque does no work
-    msg = (f'{raw.path}: topic missing: '
-           f'{torque_topic or f"{APPLIED_TORQUE} (or {TORQUE_COMMAND})"} is needed; '
-           f'the bag has {", ".join([*raw.topics, *raw.others]) or "none"}')
+    msg = (
+        f'{raw.path}: topic missing: '
+        f'{torque_topic or f"{APPLIED_TORQUE} (or {TORQUE_COMMAND})"} is needed; '
+        f'the bag has {", ".join([*raw.topics, *raw.others]) or "none"}'
+    )
     raise RecordingError(msg)
 
 
@@ -113,19 +113,20 @@ def _clean(raw: RawRecording, topic_name: str) -> dict[str, tuple[np.ndarray, np
         if len(bad):
             k = int(bad[0])
             since = (samples.stamp_ns[k] - samples.stamp_ns[0]) / NS_PER_S
-            msg = (f'{where}: {mechanism.channel(name).place} is {values[k]} at sample {k} '
-                   f'(t = {since:.3f} s); {len(bad)} such value(s), only finite ones are allowed')
+            msg = (
+                f'{where}: {mechanism.channel(name).place} is {values[k]} at sample {k} '
+                f'(t = {since:.3f} s); {len(bad)} such value(s), only finite ones are allowed'
+            )
             raise RecordingError(msg)
         cleaned[name] = _ordered(where, samples.stamp_ns[keep], values[keep])
     if not cleaned:
-        raise RecordingError(f'{where}: no value that the analysis reads; it has '
-                             f'{len(samples)} message(s)')
+        raise RecordingError(
+            f'{where}: no value that the analysis reads; it has {len(samples)} message(s)'
+        )
     return cleaned
 
 
-def _ordered(
-    where: str, stamps: np.ndarray, values: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _ordered(where: str, stamps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Samples in strict order of stamps, or an error where order cannot be restored."""
     if len(stamps) < 2:
         raise RecordingError(f'{where}: {len(stamps)} sample(s); at least 2 are needed')
@@ -144,8 +145,10 @@ def _ordered(
     moved = bool(np.any(np.diff(order) < 0))
     irregular = moved and spacing.min() < REGULAR_AFTER_SORTING * np.median(spacing)
     if len(conflicting) or irregular:
-        msg = (f'{where}: stamps run backwards or stand still at sample {first} '
-               f'(t = {at:.3f} s) and sorting does not restore a regular order; '
-               'stamps must increase (`check` shows every place)')
+        msg = (
+            f'{where}: stamps run backwards or stand still at sample {first} '
+            f'(t = {at:.3f} s) and sorting does not restore a regular order; '
+            'stamps must increase (`check` shows every place)'
+        )
         raise RecordingError(msg)
     return stamps, values

@@ -65,8 +65,9 @@ def _write(path: Path, record: Record, commands: dict[str, Any]) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     mechanism = channels.mechanism(record.mechanism)
     signals = {**record.inputs, **record.outputs}
-    series = [(topic, signals) for topic in mechanism.topics.values()
-              if topic.name != TORQUE_COMMAND]
+    series = [
+        (topic, signals) for topic in mechanism.topics.values() if topic.name != TORQUE_COMMAND
+    ]
     if commands:
         series.append((mechanism.command, commands))
     first = int(record.stamp_ns[0])

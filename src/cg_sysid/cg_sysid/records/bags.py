@@ -26,8 +26,17 @@ from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.records.raw import NOTE, RawRecording, RawTopic
 from cg_sysid.records.record import NS_PER_S, SHARED_ROW_NS, Record
 
-__all__ = ['RawRecording', 'RawTopic', 'load_note', 'no_bag', 'parse_note', 'read_bag', 'read_raw',
-           'to_record', 'write_bag']
+__all__ = [
+    'RawRecording',
+    'RawTopic',
+    'load_note',
+    'no_bag',
+    'parse_note',
+    'read_bag',
+    'read_raw',
+    'to_record',
+    'write_bag',
+]
 
 LONGEST_REASON = 300  # characters of what a library says
 
@@ -82,9 +91,7 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
         raise RecordingError(f'{path}: not a readable rosbag2 recording ({what})') from error
 
 
-def _read_open(
-    path: Path, reader: AnyReader, note: Mapping[str, Any] | None
-) -> RawRecording:
+def _read_open(path: Path, reader: AnyReader, note: Mapping[str, Any] | None) -> RawRecording:
     """The body of `read_raw`, on an open reader."""
     if reader.message_count == 0:
         raise RecordingError(f'{path}: empty; the bag holds no message')
@@ -95,8 +102,10 @@ def _read_open(
     for connection in used:
         expected = topics[connection.topic].msgtype
         if connection.msgtype != expected:
-            msg = (f'{path}: topic {connection.topic} has type {connection.msgtype}; '
-                   f'{expected} is needed')
+            msg = (
+                f'{path}: topic {connection.topic} has type {connection.msgtype}; '
+                f'{expected} is needed'
+            )
             raise RecordingError(msg)
     samples: dict[str, list[tuple[int, int, dict[str, float]]]] = {c.topic: [] for c in used}
     for connection, log_ns, data in reader.messages(connections=used) if used else ():
@@ -190,9 +199,11 @@ def _checked_note(text: str, where: str, schema: Form) -> dict[str, Any]:
 
 def _mechanism_of(path: Path, note: Mapping[str, Any]) -> channels.Mechanism:
     if not note.get('mechanism'):
-        msg = (f'{path}: nothing says which mechanism was recorded; put a note with '
-               f'`mechanism` and `setup` on {EXPERIMENT} or give one (--note note.yaml); '
-               f'mechanisms are {", ".join(channels.MECHANISMS)}')
+        msg = (
+            f'{path}: nothing says which mechanism was recorded; put a note with '
+            f'`mechanism` and `setup` on {EXPERIMENT} or give one (--note note.yaml); '
+            f'mechanisms are {", ".join(channels.MECHANISMS)}'
+        )
         raise RecordingError(msg)
     try:
         return channels.mechanism(note['mechanism'])

@@ -63,7 +63,8 @@ def mend_clocks(raw: RawRecording) -> tuple[RawRecording, list[Finding]]:
         The recording with regular stamps, and a finding for each jump.
     """
     topics = {
-        name: t for name, t in raw.topics.items()
+        name: t
+        for name, t in raw.topics.items()
         if name not in (EXPERIMENT, TORQUE_COMMAND) and usual_spacing(t.stamp_ns)
     }
     jumps = [jump for topic in topics.values() for jump in _out_of_line(topic)]
@@ -131,7 +132,7 @@ def lost_behind_stamps(topic: RawTopic, end_ns: float) -> tuple[list[int], int]:
         # Few are lost, if any. A message held up on its way is late too, but not for good.
         level = np.median(np.lib.stride_tricks.sliding_window_view(offset, 5), axis=1)
         for_good = np.zeros(len(late))
-        for_good[4: 4 + len(level) - 5] = np.rint(level[5:] - level[:-5])
+        for_good[4 : 4 + len(level) - 5] = np.rint(level[5:] - level[:-5])
         late = np.where(np.diff(offset) > 0.5, for_good, 0.0)
     places = np.flatnonzero(late >= 1.0)
     found = [int(i) + 1 for i in places[:MOST_HOLES]]
@@ -151,7 +152,7 @@ def _out_of_line(topic: RawTopic) -> list[Jump]:
     found = []
     for k in np.flatnonzero(np.abs(excess) > OUT_OF_LINE * usual):
         # Two messages that overtook each other, or one late stamp, leave the rest in line.
-        left, right = stamp[max(0, k - 4): k + 1], stamp[k + 1: k + 6]
+        left, right = stamp[max(0, k - 4) : k + 1], stamp[k + 1 : k + 6]
         left = left + usual * (len(left) - 1 - np.arange(len(left)))
         right = right - usual * (1 + np.arange(len(right)))
         lasting = np.median(right) - np.median(left)
@@ -199,7 +200,7 @@ def _by_recorder(topic: RawTopic, jump: Jump) -> float:
     if not independent_arrivals(topic):
         return 0.0
     offset, k = (topic.log_ns - topic.stamp_ns).astype(float), jump.sample
-    before, after = offset[max(0, k - FLOOR): k], offset[k: k + FLOOR]
+    before, after = offset[max(0, k - FLOOR) : k], offset[k : k + FLOOR]
     if min(len(before), len(after)) < FLOOR // 2:
         return 0.0
     windows = np.lib.stride_tricks.sliding_window_view(offset, FLOOR).min(axis=1)
@@ -253,7 +254,7 @@ def _prediction(values: np.ndarray, k: int, elapsed: float) -> tuple[float, floa
     for degree in (0, 1, 2):
         solve = np.linalg.pinv(np.vander(at, degree + 1, increasing=True))
         weights = (round(elapsed) + middle) ** np.arange(degree + 1) @ solve
-        errors = target[first + shift: last + shift] - before[first:last] @ weights
+        errors = target[first + shift : last + shift] - before[first:last] @ weights
         usual = max(float(np.sqrt(np.mean(errors**2))), 1e-12 * float(np.ptp(values)), 1e-300)
         if best is None or usual < best[1]:
             weights = (elapsed + middle) ** np.arange(degree + 1) @ solve
@@ -297,7 +298,14 @@ def _finding(jump: Jump, topic: RawTopic, origin: int, repaired: bool) -> Findin
     repair = f'the stamps after the jump were moved by {-size:+.4g} ms' if repaired else ''
     ends = sorted((jump.before_ns, int(topic.stamp_ns[jump.sample])))
     return Finding(
-        'clock_jump', 'warning' if repaired else 'error', jump.topic, text,
-        (ends[0] - origin) / NS_PER_S, (ends[1] - origin) / NS_PER_S, jump.sample,
-        jump.excess_ns / NS_PER_S, 0.0, repair,
+        'clock_jump',
+        'warning' if repaired else 'error',
+        jump.topic,
+        text,
+        (ends[0] - origin) / NS_PER_S,
+        (ends[1] - origin) / NS_PER_S,
+        jump.sample,
+        jump.excess_ns / NS_PER_S,
+        0.0,
+        repair,
     )

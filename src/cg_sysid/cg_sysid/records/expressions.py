@@ -59,14 +59,18 @@ class Expression(Kind):
         if isinstance(value, int | float) and not isinstance(value, bool):
             value = {'constant': value}
         if not isinstance(value, dict):
-            raise place.wrong(f'{shown(value)} is no expression; a number, a column or a mapping '
-                              f'with one of {", ".join(OPERATIONS)} is needed')
+            raise place.wrong(
+                f'{shown(value)} is no expression; a number, a column or a mapping '
+                f'with one of {", ".join(OPERATIONS)} is needed'
+            )
         found = EXPRESSION.read(value, place)
         operations = [key for key in OPERATIONS if key in found]
         if len(operations) != 1:
-            raise place.wrong(f'exactly one of {", ".join(OPERATIONS)} is needed; '
-                              f'there {"are" if operations else "is"} '
-                              f'{", ".join(operations) or "none"}')
+            raise place.wrong(
+                f'exactly one of {", ".join(OPERATIONS)} is needed; '
+                f'there {"are" if operations else "is"} '
+                f'{", ".join(operations) or "none"}'
+            )
         if found.get('unit') == COUNTS and 'counts_per_rev' not in found:
             raise place.key('counts_per_rev').wrong(f'is missing; unit {COUNTS} needs it')
         return found

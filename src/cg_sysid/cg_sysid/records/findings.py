@@ -11,8 +11,12 @@ from rich.table import Table
 SEVERITIES = ('info', 'warning', 'error')
 VERDICTS = ('good', 'warnings', 'unusable')
 COLOURS = {
-    'info': 'cyan', 'warning': 'yellow', 'error': 'red',
-    'good': 'green', 'warnings': 'yellow', 'unusable': 'red',
+    'info': 'cyan',
+    'warning': 'yellow',
+    'error': 'red',
+    'good': 'green',
+    'warnings': 'yellow',
+    'unusable': 'red',
 }
 
 # Errors that a person may overrule, and why each makes a recording unusable. With what is not

@@ -70,8 +70,11 @@ class Patterns(Kind):
         for pattern in patterns:
             # What pathlib takes, and nothing outside of the folder.
             parts = pattern.split('/')
-            if not all(parts) or {'..', '.'} & set(parts) or parts.count('**') > 1 or any(
-                '**' in part and part != '**' for part in parts
+            if (
+                not all(parts)
+                or {'..', '.'} & set(parts)
+                or parts.count('**') > 1
+                or any('**' in part and part != '**' for part in parts)
             ):
                 raise place.wrong(f'{shown(pattern)} is no pattern; {self.words} is needed')
         return patterns
@@ -267,7 +270,7 @@ def _parts(mapping: dict, table: Table, path: Path) -> Iterator[np.ndarray]:
         values = table.take(rows).numbers(border['column'], f'{path}: split.at')
         changes |= (values[:-1] < border['value']) & (values[1:] >= border['value'])
     for part in np.split(rows, np.flatnonzero(changes) + 1):
-        kept = part[split['drop_first']:max(0, len(part) - split['drop_last'])]
+        kept = part[split['drop_first'] : max(0, len(part) - split['drop_last'])]
         if len(kept) >= split['min_rows']:
             yield kept
 
@@ -286,9 +289,7 @@ def _matches(rule: dict[str, Any], table: Table, where: str) -> np.ndarray:
     return matches
 
 
-def _record_of(
-    mapping: dict, path: Path, table: Table, rows: np.ndarray, number: int
-) -> Imported:
+def _record_of(mapping: dict, path: Path, table: Table, rows: np.ndarray, number: int) -> Imported:
     part = table.take(rows)
     where = f'{path}: mapping {mapping["name"]}'
     entries = _with_case(mapping, part, where)
@@ -372,15 +373,15 @@ def _start_ns(start: str | dict[str, str], path: Path) -> int:
         try:
             begin = datetime.strptime(path.stem, form).replace(tzinfo=timezone.utc)
         except (ValueError, re.error):
-            raise RecordingError(f'{path}: start.from_name: the name of the file cannot be read '
-                                 f'as a time of the form {shown(form)}') from None
+            raise RecordingError(
+                f'{path}: start.from_name: the name of the file cannot be read '
+                f'as a time of the form {shown(form)}'
+            ) from None
     since = begin - datetime(1970, 1, 1, tzinfo=timezone.utc)
     return since // timedelta(microseconds=1) * 1000
 
 
-def _part_name(
-    mapping: dict, path: Path, part: Table, number: int, template: str
-) -> str:
+def _part_name(mapping: dict, path: Path, part: Table, number: int, template: str) -> str:
     """Name of a part: the mapping's, the file's, its number, values that it was split by."""
     known = {name: _plain(values[0]) for name, values in part.items()}
     known |= {'name': mapping['name'], 'stem': path.stem, 'part': number}
@@ -393,11 +394,14 @@ def _part_name(
             if key is None:
                 continue
             if key not in known:
-                raise RecordingError(f'{where}: cannot be filled: there is no {shown(key)}; '
-                                     f'allowed are {", ".join(known)}')
+                raise RecordingError(
+                    f'{where}: cannot be filled: there is no {shown(key)}; '
+                    f'allowed are {", ".join(known)}'
+                )
             if conversion or not re.fullmatch('(0?[1-9])?d?', form or ''):
-                raise RecordingError(f'{where}: only {{name}} and forms such as {{name:02d}} '
-                                     'are allowed')
+                raise RecordingError(
+                    f'{where}: only {{name}} and forms such as {{name:02d}} are allowed'
+                )
             value = known[key]
             name += f'{value:{form}}' if isinstance(value, int) else str(value)
     except ValueError as error:

@@ -118,7 +118,7 @@ def _fitted(
     half = width // 2
     inner = slice(half, len(values) - half)
     use = moving[inner]
-    use[: REACH] = use[-REACH:] = False
+    use[:REACH] = use[-REACH:] = False
     if use.sum() < FEWEST:
         return None
     square = contrasts(time, values - values[0], width)[use] ** 2

@@ -91,14 +91,10 @@ class Journal:
         """
         if msgtype not in self._schemas:
             number = len(self._schemas) + 1
-            content = (
-                struct.pack('<H', number) + _text(msgtype) + _text('ros2msg') + _text(msgdef)
-            )
+            content = struct.pack('<H', number) + _text(msgtype) + _text('ros2msg') + _text(msgdef)
             self._schemas[msgtype] = (number, _record(SCHEMA, content))
         number = len(self._channels) + 1
-        self._channels[number] = _channel(
-            number, self._schemas[msgtype][0], topic, 'cdr', msgtype
-        )
+        self._channels[number] = _channel(number, self._schemas[msgtype][0], topic, 'cdr', msgtype)
         self._write_chunk(self._schemas[msgtype][1] + self._channels[number], 0)
         return number
 

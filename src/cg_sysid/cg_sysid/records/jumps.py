@@ -91,7 +91,7 @@ def find_step(
         limit = np.maximum(least, USUAL * _usual(np.abs(distance), span))
         for k in holes:
             a, b = np.searchsorted(grid, [time[k], time[k + 1]])
-            limit[max(0, a - span): b + span] = np.inf
+            limit[max(0, a - span) : b + span] = np.inf
         score[i], size[i] = np.abs(distance) / limit, distance
     # Two spans must agree; the better of such pairs counts.
     agreed = np.zeros(len(grid))
@@ -152,7 +152,7 @@ def on_grid(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _step(time, grid, sampled, k, span, sigma, quantum, limit) -> Step:
     """What the step between the grid's samples k - 1 and k is like."""
     noise = float(np.hypot(sigma, quantum / np.sqrt(12.0)))
-    left, right = sampled[k - span: k], sampled[k: k + span]
+    left, right = sampled[k - span : k], sampled[k : k + span]
     at = (np.arange(span) + 0.5) * (grid[1] - grid[0])
     solve = np.linalg.pinv(np.vander(at, 3, increasing=True))
     before, after = solve @ left[::-1], solve @ right
@@ -186,7 +186,7 @@ def _distance(values: np.ndarray, span: int) -> np.ndarray:
     """Distance of the parabolas between samples k - 1 and k, 0 near the ends, shape (M,)."""
     weights = np.concatenate([-_edge(span)[::-1], _edge(span)])
     distance = np.zeros(len(values))
-    distance[span: len(values) - span + 1] = np.correlate(values, weights, 'valid')
+    distance[span : len(values) - span + 1] = np.correlate(values, weights, 'valid')
     return distance
 
 
@@ -201,8 +201,11 @@ def _usual(distance: np.ndarray, span: int) -> np.ndarray:
     block = 10
     levels = np.array([b.max() for b in np.array_split(distance, max(1, len(distance) // block))])
     reach, own = max(100, AROUND * span) // block, span // block + 1
-    padded = np.pad(levels, reach, mode='reflect') if len(levels) > reach else np.pad(
-        levels, reach, mode='edge')
+    padded = (
+        np.pad(levels, reach, mode='reflect')
+        if len(levels) > reach
+        else np.pad(levels, reach, mode='edge')
+    )
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
     others = np.abs(np.arange(-reach, reach + 1)) > own
     usual = np.quantile(around[:, others], 0.75, axis=1)

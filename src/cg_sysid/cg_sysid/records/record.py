@@ -51,15 +51,19 @@ class Record:
         known = channels.mechanism(self.mechanism)
         stamp = np.array(self.stamp_ns)
         if stamp.ndim != 1 or stamp.dtype.kind not in 'iu':
-            raise self._error(f'stamp_ns has shape {stamp.shape} and type {stamp.dtype}; '
-                              'a vector of integer nanoseconds is needed')
+            raise self._error(
+                f'stamp_ns has shape {stamp.shape} and type {stamp.dtype}; '
+                'a vector of integer nanoseconds is needed'
+            )
         if len(stamp) < 2:
             raise self._error(f'{len(stamp)} row(s); at least 2 are needed')
         backward = np.flatnonzero(np.diff(stamp) <= 0)
         if len(backward):
             k = int(backward[0]) + 1
-            raise self._error(f'stamp_ns[{k}] = {stamp[k]} does not come after '
-                              f'{stamp[k - 1]}; stamps must increase strictly')
+            raise self._error(
+                f'stamp_ns[{k}] = {stamp[k]} does not come after '
+                f'{stamp[k - 1]}; stamps must increase strictly'
+            )
         object.__setattr__(self, 'stamp_ns', _frozen(stamp.astype(np.int64)))
         allowed_inputs = (*known.input_names, *known.extra_input_names)
         object.__setattr__(self, 'inputs', self._signals('input', self.inputs, allowed_inputs))
@@ -68,11 +72,14 @@ class Record:
         )
         missing = [name for name in known.input_names if name not in self.inputs]
         if missing:
-            raise self._error(f'input {missing[0]} is missing; {self.mechanism} needs '
-                              f'{", ".join(known.input_names)}')
+            raise self._error(
+                f'input {missing[0]} is missing; {self.mechanism} needs '
+                f'{", ".join(known.input_names)}'
+            )
         if not self.outputs:
-            raise self._error(f'no output; at least one of {", ".join(known.output_names)} '
-                              'is needed')
+            raise self._error(
+                f'no output; at least one of {", ".join(known.output_names)} is needed'
+            )
 
     def _signals(
         self, kind: str, signals: dict[str, np.ndarray], allowed: Sequence[str]
@@ -81,12 +88,15 @@ class Record:
         checked = {}
         for name, values in signals.items():
             if name not in allowed:
-                raise self._error(f'unknown {kind} {name!r}; {self.mechanism} has '
-                                  f'{", ".join(allowed)}')
+                raise self._error(
+                    f'unknown {kind} {name!r}; {self.mechanism} has {", ".join(allowed)}'
+                )
             array = np.array(values, dtype=float)
             if array.shape != self.stamp_ns.shape:
-                raise self._error(f'{kind} {name} has shape {array.shape}, stamp_ns '
-                                  f'{self.stamp_ns.shape}; they must agree')
+                raise self._error(
+                    f'{kind} {name} has shape {array.shape}, stamp_ns '
+                    f'{self.stamp_ns.shape}; they must agree'
+                )
             bad = np.isinf(array) if kind == 'output' else ~np.isfinite(array)
             if bad.any():
                 k = int(np.flatnonzero(bad)[0])
@@ -145,8 +155,10 @@ class Record:
         rows = (time >= start_s) & (time < stop_s)
         name = f'{self.name}[{start_s:g}..{stop_s:g} s]'
         if rows.sum() < 2:
-            msg = (f'record {name!r}: {rows.sum()} row(s) in the span; at least 2 are needed '
-                   f'(the record spans 0..{self.duration:g} s)')
+            msg = (
+                f'record {name!r}: {rows.sum()} row(s) in the span; at least 2 are needed '
+                f'(the record spans 0..{self.duration:g} s)'
+            )
             raise RecordingError(msg)
         outputs = {c: v[rows] for c, v in self.outputs.items() if not np.isnan(v[rows]).all()}
         inputs = {c: v[rows] for c, v in self.inputs.items()}

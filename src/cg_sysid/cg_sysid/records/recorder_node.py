@@ -58,7 +58,7 @@ class RecorderNode(Node):
         self._first_sample_at: float | None = None
         self._was_ready = False
         self._note_heard = False
-        self._look_at = 0.0
+        self._screen_at = 0.0
         self._scene: list[tuple[int, bool]] = []
         self._scene_at = 0.0
         # Waiting messages of all topics share one thread; the depth rides out a busy machine.
@@ -107,8 +107,8 @@ class RecorderNode(Node):
         now = time.monotonic()
         if self.finished:
             return 0.0
-        if not self.recording.begun and now >= self._look_at:
-            self._look_at = now + READY_PERIOD
+        if not self.recording.begun and now >= self._screen_at:
+            self._screen_at = now + READY_PERIOD
             try:
                 self._begin_if_heard(now)
             except OSError as error:

@@ -490,9 +490,7 @@ def _result(target: Path, contents: Contents, begun: int, count: int) -> Recover
         for topic in topics
         if topic.delays and topic.delays[1] - topic.delays[0] > LATE_NS
     }
-    losses = tuple(
-        _loss(found, gap) for found in contents.surveys for gap in found.gaps
-    )
+    losses = tuple(_loss(found, gap) for found in contents.surveys for gap in found.gaps)
     return Recovered(target, count, losses, undecodable, contents.left_out, late, slow)
 
 

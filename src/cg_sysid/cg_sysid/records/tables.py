@@ -52,8 +52,10 @@ class Table(dict[str, np.ndarray]):
             RecordingError: There is none of that name; those there are are listed.
         """
         if name not in self:
-            raise RecordingError(f'{where}: no column {shown(name)}; the file has '
-                                 f'{", ".join(self)}{meant(name, self)}')
+            raise RecordingError(
+                f'{where}: no column {shown(name)}; the file has '
+                f'{", ".join(self)}{meant(name, self)}'
+            )
         return self[name]
 
     def numbers(self, name: Any, where: str) -> np.ndarray:
@@ -117,8 +119,10 @@ def _read_csv(path: Path) -> Table:
             if not row:
                 continue
             if len(row) != len(header):
-                msg = (f'{path}: line {reader.line_num} has {len(row)} fields, '
-                       f'the header {len(header)}')
+                msg = (
+                    f'{path}: line {reader.line_num} has {len(row)} fields, '
+                    f'the header {len(header)}'
+                )
                 raise RecordingError(msg)
             body.append(row)
             lines.append(reader.line_num)
@@ -132,7 +136,7 @@ def _read_csv(path: Path) -> Table:
         try:
             columns[name] = np.array(cells, dtype=float)
         except ValueError:
-            columns[name] = np.array(cells, dtype=object)  # text, as a name of a trial
+            columns[name] = np.array(cells, dtype=object)  # text, as a name of a data set
     return Table(columns, lines=np.array(lines, dtype=int))
 
 
@@ -180,12 +184,19 @@ def _read_json(path: Path) -> Table:
         raise RecordingError(msg)
     samples = ListOf(Number(infinite=True, nan=True))
     lists = {name: value for name, value in content.items() if isinstance(value, list)}
-    return _same_length({
-        name: np.array(samples.of(
-            [float('nan') if v is None else v for v in value], str(path), RecordingError, name
-        ))
-        for name, value in lists.items()
-    })
+    return _same_length(
+        {
+            name: np.array(
+                samples.of(
+                    [float('nan') if v is None else v for v in value],
+                    str(path),
+                    RecordingError,
+                    name,
+                )
+            )
+            for name, value in lists.items()
+        }
+    )
 
 
 def _same_length(columns: dict[str, np.ndarray]) -> Table:

@@ -110,7 +110,7 @@ def over_gap(time: np.ndarray, values: np.ndarray, first: int, last: int) -> np.
     Returns:
         Values at samples first + 1 .. last - 1.
     """
-    share = (time[first + 1: last] - time[first]) / (time[last] - time[first])
+    share = (time[first + 1 : last] - time[first]) / (time[last] - time[first])
     before, start, stop, after = values[[first - 1, first, last, last + 1]]
     return _between(before, start, stop, after, share, last - first)
 
@@ -119,10 +119,7 @@ def _between(before, start, stop, after, share, steps):
     """Cubic over a gap of `steps` samples that goes on with the slopes beside it."""
     left, right = (start - before) * steps, (after - stop) * steps
     s, r = share, 1.0 - share
-    return (
-        (1 + 2 * s) * r**2 * start + (1 + 2 * r) * s**2 * stop
-        + s * r * (r * left - s * right)
-    )
+    return (1 + 2 * s) * r**2 * start + (1 + 2 * r) * s**2 * stop + s * r * (r * left - s * right)
 
 
 def _fill_error(values: np.ndarray, whole: np.ndarray, lost: int) -> float:
@@ -140,9 +137,9 @@ def _fill_error(values: np.ndarray, whole: np.ndarray, lost: int) -> float:
     there = np.lib.stride_tricks.sliding_window_view(whole, steps + 2).all(axis=1)
     if there.sum() < FEWEST:
         return float('inf')
-    before, start = values[:n], values[1: n + 1]
-    stop, after = values[1 + steps: n + 1 + steps], values[2 + steps: n + 2 + steps]
+    before, start = values[:n], values[1 : n + 1]
+    stop, after = values[1 + steps : n + 1 + steps], values[2 + steps : n + 2 + steps]
     middle = steps // 2
     filled = _between(before, start, stop, after, middle / steps, steps)
-    errors = np.abs(filled - values[1 + middle: n + 1 + middle])[there]
+    errors = np.abs(filled - values[1 + middle : n + 1 + middle])[there]
     return float(np.quantile(errors, QUANTILE))

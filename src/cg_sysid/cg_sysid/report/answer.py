@@ -241,9 +241,7 @@ def gain(facts: Facts) -> Markup | None:
     if not rows:
         return None
     changed = any(_changed(g) for g in rows.values())
-    ratios = [
-        g[k] / g['noise_floor'] for g in rows.values() for k in ('before', 'after') if g[k]
-    ]
+    ratios = [g[k] / g['noise_floor'] for g in rows.values() for k in ('before', 'after') if g[k]]
     low = min(0.5, 0.8 * min(ratios))
     high = max(20.0, 1.5 * max(ratios))
     ticks = _ticks(low, high)

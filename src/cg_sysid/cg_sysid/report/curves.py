@@ -18,8 +18,8 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.checks.faults import FaultSignal, as_arrays, from_arrays
-from cg_sysid.identification.data_set import Trial, sensor_matrix
-from cg_sysid.identification.identify import in_trial
+from cg_sysid.identification.data_set import DataSet, sensor_matrix
+from cg_sysid.identification.identify import in_data_set
 
 FILE_NAME = 'curves.npz'
 FORMAT = 'cg_curves/1'
@@ -56,34 +56,34 @@ SIGNALS = ('time', 'inputs', 'measured', 'before', 'after', 'position', 'rate')
 
 
 def make_curve(
-    trial: Trial,
+    data_set: DataSet,
     role: str,
     before: Model,
     before_motion: np.ndarray,
     after: Model,
     after_motion: np.ndarray,
 ) -> Curve:
-    """Simulate a trial with two models, each from its own fitted initial motion.
+    """Simulate a data set with two models, each from its own fitted initial motion.
 
     Args:
-        trial: The record.
+        data_set: The record.
         role: `train`, `held` or `all`.
         before: The model before.
-        before_motion: What the trial has of its own there (Fit.motions).
+        before_motion: What the data set has of its own there (Fit.motions).
         after: The model after.
         after_motion: The same for the model after.
     """
-    outputs, _ = _simulated(before, trial, before_motion)
-    better, states = _simulated(after, trial, after_motion)
-    matrix = sensor_matrix(after.mechanism, trial.setup)
+    outputs, _ = _simulated(before, data_set, before_motion)
+    better, states = _simulated(after, data_set, after_motion)
+    matrix = sensor_matrix(after.mechanism, data_set.setup)
     m = matrix.shape[1] // 2
     angle = np.array([row[:m] if np.any(row[:m]) else row[m:] for row in matrix])
     return Curve(
-        name=trial.name,
+        name=data_set.name,
         role=role,
-        time=trial.time,
-        inputs=trial.inputs,
-        measured=trial.outputs,
+        time=data_set.time,
+        inputs=data_set.inputs,
+        measured=data_set.outputs,
         before=outputs,
         after=better,
         position=states[:, :m] @ angle.T,
@@ -92,14 +92,14 @@ def make_curve(
 
 
 def _simulated(
-    model: Model, trial: Trial, motion: np.ndarray
+    model: Model, data_set: DataSet, motion: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    model, motion = in_trial(model, motion)
-    compiled = compile_model(model, trial.setup)
-    p = parameter_vector(model, trial.setup)
-    u = trial.inputs_for(compiled.input_names)
-    states = compiled.simulate(trial.time, u, compiled.initial_state(motion, u[0], p), p)
-    return compiled.outputs(trial.time, u, states, p), states
+    model, motion = in_data_set(model, motion)
+    compiled = compile_model(model, data_set.setup)
+    p = parameter_vector(model, data_set.setup)
+    u = data_set.inputs_for(compiled.input_names)
+    states = compiled.simulate(data_set.time, u, compiled.initial_state(motion, u[0], p), p)
+    return compiled.outputs(data_set.time, u, states, p), states
 
 
 def save(

@@ -19,12 +19,12 @@ from cg_description.schema import Mapping as Form
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.model import Model
-from cg_sysid.checks.loading import Intake
+from cg_sysid.checks.loading import Loaded
 from cg_sysid.diagnosis.landing_cause import landing_gains, words
 from cg_sysid.diagnosis.next_step import next_step
 from cg_sysid.diagnosis.result import Cause, Diagnosis, gains_of
 from cg_sysid.diagnosis.summary import INTERVAL, is_determined
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.unknowns import Unknown
@@ -47,7 +47,7 @@ Facts = dict[str, Any]
 
 def diagnosis_facts(
     diagnosis: Diagnosis,
-    intake: Intake,
+    loaded: Loaded,
     provenance: Mapping[str, Any],
     curves: Sequence[Curve] = (),
 ) -> Facts:
@@ -55,90 +55,94 @@ def diagnosis_facts(
 
     Args:
         diagnosis: The answer.
-        intake: The bags behind it.
+        loaded: The bags behind it.
         provenance: See provenance.py.
         curves: Measured and simulated signals; from those held out the character of the
             remaining error is read.
     """
-    trials = (*diagnosis.train, *diagnosis.held)
+    data_sets = (*diagnosis.train, *diagnosis.held)
     roles = ('train',) * len(diagnosis.train) + ('held',) * len(diagnosis.held)
     fit = diagnosis.extended.train
     errors = [
         np.vstack([c.train.mse, c.held.mse]) for c in (diagnosis.baseline, diagnosis.extended)
     ]
     counts = np.vstack([fit.count, diagnosis.extended.held.count])
-    return _with_next({
-        **_head(
-            DIAGNOSIS, diagnosis.verdict, diagnosis.summary + _in_spite_of(intake),
-            diagnosis.nominal,
-        ),
-        'causes': [_cause(cause, diagnosis.extended.model) for cause in diagnosis.causes],
-        'gain': {
-            g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in diagnosis.gains
-        },
-        'gain_from_measured_start': _measured_start(diagnosis),
-        'remaining_error': {
-            channel: {
-                'chi2_per_sample': chi2,
-                'in_noise': math.sqrt(max(chi2, 0.0)),
-                **_character(diagnosis.nominal, channel, curves),
-            }
-            for channel, chi2 in diagnosis.remaining.items()
-            if channel in {g.channel for g in diagnosis.gains}
-        },
-        'unmodelled': _unmodelled(diagnosis),
-        'wandering': _wandering(diagnosis),
-        'late_samples': diagnosis.late,
-        'landings': _landings(diagnosis),
-        'unfinished': _unfinished(diagnosis),
-        'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
-        **_fitted(diagnosis.nominal, fit),
-        'findings': list(diagnosis.findings),
-        **_data(diagnosis.nominal, trials, roles, errors, counts, intake),
-        'provenance': dict(provenance),
-    })
+    return _with_next(
+        {
+            **_head(
+                DIAGNOSIS,
+                diagnosis.verdict,
+                diagnosis.summary + _in_spite_of(loaded),
+                diagnosis.nominal,
+            ),
+            'causes': [_cause(cause, diagnosis.extended.model) for cause in diagnosis.causes],
+            'gain': {
+                g.channel: _gain(g.before, g.after, g.noise, g.unit) for g in diagnosis.gains
+            },
+            'gain_from_measured_start': _measured_start(diagnosis),
+            'remaining_error': {
+                channel: {
+                    'chi2_per_sample': chi2,
+                    'in_noise': math.sqrt(max(chi2, 0.0)),
+                    **_character(diagnosis.nominal, channel, curves),
+                }
+                for channel, chi2 in diagnosis.remaining.items()
+                if channel in {g.channel for g in diagnosis.gains}
+            },
+            'unmodelled': _unmodelled(diagnosis),
+            'wandering': _wandering(diagnosis),
+            'late_samples': diagnosis.late,
+            'landings': _landings(diagnosis),
+            'unfinished': _unfinished(diagnosis),
+            'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
+            **_fitted(diagnosis.nominal, fit),
+            'findings': list(diagnosis.findings),
+            **_data(diagnosis.nominal, data_sets, roles, errors, counts, loaded),
+            'provenance': dict(provenance),
+        }
+    )
 
 
 def unusable_facts(
-    model: Model, intake: Intake, reason: str, provenance: Mapping[str, Any]
+    model: Model, loaded: Loaded, reason: str, provenance: Mapping[str, Any]
 ) -> Facts:
     """The facts where the recordings do not allow a diagnosis.
 
     Args:
         model: The model that was to be diagnosed.
-        intake: The bags and what is wrong with them.
+        loaded: The bags and what is wrong with them.
         reason: Why nothing was fitted, one sentence.
         provenance: See provenance.py.
     """
-    return _with_next({
-        **_head(DIAGNOSIS, 'unusable', reason + _in_spite_of(intake), model),
-        'causes': [],
-        'gain': {},
-        'gain_from_measured_start': None,
-        'remaining_error': {},
-        'unmodelled': None,
-        'wandering': None,
-        'late_samples': '',
-        'landings': None,
-        'unfinished': None,
-        'ranking': [],
-        'parameters': [
-            _parameter(model, name, None) for name in model.declarations
-        ],
-        'correlation': {'names': [], 'matrix': []},
-        'fit': None,
-        'findings': [],
-        **_data(model, (), (), [], np.zeros((0, 0)), intake),
-        'provenance': dict(provenance),
-    })
+    return _with_next(
+        {
+            **_head(DIAGNOSIS, 'unusable', reason + _in_spite_of(loaded), model),
+            'causes': [],
+            'gain': {},
+            'gain_from_measured_start': None,
+            'remaining_error': {},
+            'unmodelled': None,
+            'wandering': None,
+            'late_samples': '',
+            'landings': None,
+            'unfinished': None,
+            'ranking': [],
+            'parameters': [_parameter(model, name, None) for name in model.declarations],
+            'correlation': {'names': [], 'matrix': []},
+            'fit': None,
+            'findings': [],
+            **_data(model, (), (), [], np.zeros((0, 0)), loaded),
+            'provenance': dict(provenance),
+        }
+    )
 
 
 def identification_facts(
     model: Model,
     fit: Fit,
     before: Fit | None,
-    trials: Sequence[Trial],
-    intake: Intake,
+    data_sets: Sequence[DataSet],
+    loaded: Loaded,
     method: str,
     provenance: Mapping[str, Any],
     curves: Sequence[Curve] = (),
@@ -147,15 +151,15 @@ def identification_facts(
 
     Args:
         model: The model as it was given.
-        fit: The identification, on all trials.
-        before: Score of the model as given on the same trials; None if it runs away.
-        trials: The records.
-        intake: The bags behind them.
+        fit: The identification, on all data sets.
+        before: Score of the model as given on the same data sets; None if it runs away.
+        data_sets: The records.
+        loaded: The bags behind them.
         method: Name of the method.
         provenance: See provenance.py.
         curves: Measured and simulated signals.
     """
-    sigma = trials[0].sigma
+    sigma = data_sets[0].sigma
     total = fit.count.sum(axis=0)
     after = _rms(fit.mse, fit.count)
     start = _rms(before.mse, before.count) if before else np.full(len(sigma), np.nan)
@@ -167,37 +171,39 @@ def identification_facts(
     }
     count = len(fit.unknowns)
     summary = (
-        f'{count} parameter{"s" * (count != 1)} identified from {len(trials)} '
-        f'record{"s" * (len(trials) != 1)} by {method.replace("_", "-")} in {fit.seconds:.1f} s '
-        f'({fit.evaluations} simulations of all records)'
+        f'{count} parameter{"s" * (count != 1)} identified from {len(data_sets)} '
+        f'record{"s" * (len(data_sets) != 1)} by {method.replace("_", "-")} '
+        f'in {fit.seconds:.1f} s ({fit.evaluations} simulations of all records)'
         f'{"" if fit.converged else "; it stopped before it had converged"}.'
     )
     errors = [before.mse if before else np.full_like(fit.mse, np.nan), fit.mse]
-    return _with_next({
-        **_head(IDENTIFICATION, 'identified', summary + _in_spite_of(intake), model),
-        'method': method,
-        'causes': [],
-        'gain': gain,
-        'remaining_error': {
-            channel: {
-                'chi2_per_sample': float(a**2),
-                'in_noise': float(a),
-                **_character(model, channel, curves),
-            }
-            for (channel, _), a, n in zip(outputs, after, total, strict=True)
-            if n
-        },
-        'unmodelled': None,
-        'wandering': None,
-        'late_samples': '',
-        'landings': None,
-        'unfinished': None,
-        'ranking': [],
-        **_fitted(model, fit),
-        'findings': list(fit.warnings),
-        **_data(model, trials, ('all',) * len(trials), errors, fit.count, intake),
-        'provenance': dict(provenance),
-    })
+    return _with_next(
+        {
+            **_head(IDENTIFICATION, 'identified', summary + _in_spite_of(loaded), model),
+            'method': method,
+            'causes': [],
+            'gain': gain,
+            'remaining_error': {
+                channel: {
+                    'chi2_per_sample': float(a**2),
+                    'in_noise': float(a),
+                    **_character(model, channel, curves),
+                }
+                for (channel, _), a, n in zip(outputs, after, total, strict=True)
+                if n
+            },
+            'unmodelled': None,
+            'wandering': None,
+            'late_samples': '',
+            'landings': None,
+            'unfinished': None,
+            'ranking': [],
+            **_fitted(model, fit),
+            'findings': list(fit.warnings),
+            **_data(model, data_sets, ('all',) * len(data_sets), errors, fit.count, loaded),
+            'provenance': dict(provenance),
+        }
+    )
 
 
 def _with_next(facts: Facts) -> Facts:
@@ -281,8 +287,7 @@ def _cause(cause: Cause, model: Model) -> Facts:
             for p in cause.proposals
         ],
         'events': {
-            record: _values(values, cause.label, ranges)
-            for record, values in cause.events.items()
+            record: _values(values, cause.label, ranges) for record, values in cause.events.items()
         },
     }
 
@@ -486,9 +491,7 @@ def _candidate(c: Candidate) -> Facts:
         'held_gain': c.held_gain,
         'significance': c.significance,
         'explained_sigmas': c.explained,
-        'chi2_per_sample': {
-            'train': c.train.normalised_error, 'held': c.held.normalised_error
-        },
+        'chi2_per_sample': {'train': c.train.normalised_error, 'held': c.held.normalised_error},
         'parameters': _values(c.parameters, c.label, c.model.declarations),
         'reason': c.reason,
     }
@@ -581,45 +584,44 @@ def _windows(windows: Windows) -> Facts:
 
 def _data(
     model: Model,
-    trials: Sequence[Trial],
+    data_sets: Sequence[DataSet],
     roles: Sequence[str],
     errors: Sequence[np.ndarray],
     counts: np.ndarray,
-    intake: Intake,
+    loaded: Loaded,
 ) -> Facts:
     records = []
-    by_name = {record.name: record for record in (*intake.records, *intake.wholes)}
-    for k, (trial, role) in enumerate(zip(trials, roles, strict=True)):
-        record = by_name.get(trial.name)
+    by_name = {record.name: record for record in (*loaded.records, *loaded.wholes)}
+    for k, (data_set, role) in enumerate(zip(data_sets, roles, strict=True)):
+        record = by_name.get(data_set.name)
         records.append(
             {
-                'name': trial.name,
-                'source': intake.origin.get(trial.name, ''),
+                'name': data_set.name,
+                'source': loaded.origin.get(data_set.name, ''),
                 'role': role,
                 'experiment': str((record.note if record else {}).get('experiment', '')),
-                'setup': trial.setup.to_dict(),
-                'duration_s': trial.duration,
-                'rows': len(trial.time),
-                'rate_hz': 1 / float(np.median(np.diff(trial.time))),
-                'coverage': _coverage(model, trial),
+                'setup': data_set.setup.to_dict(),
+                'duration_s': data_set.duration,
+                'rows': len(data_set.time),
+                'rate_hz': 1 / float(np.median(np.diff(data_set.time))),
+                'coverage': _coverage(model, data_set),
                 'error': {
                     channel: {'before': float(s * np.sqrt(b)), 'after': float(s * np.sqrt(a))}
                     for channel, s, b, a, n in zip(
-                        model.mechanism.outputs, trial.sigma, errors[0][k], errors[1][k],
+                        model.mechanism.outputs, data_set.sigma, errors[0][k], errors[1][k],
                         counts[k], strict=True,
                     )
                     if n
                 },
             }
         )  # fmt: skip
-    sigma = trials[0].sigma if trials else np.zeros(0)
+    sigma = data_sets[0].sigma if data_sets else np.zeros(0)
     return {
         'noise_floor': {
-            channel: float(s)
-            for channel, s in zip(model.mechanism.outputs, sigma, strict=False)
+            channel: float(s) for channel, s in zip(model.mechanism.outputs, sigma, strict=False)
         },
         'records': records,
-        'windows': _windows(intake.windows),
+        'windows': _windows(loaded.windows),
         'sources': [
             {
                 'name': source.name,
@@ -629,7 +631,7 @@ def _data(
                 'check': source.check.verdict,
                 'findings': [_finding(f) for f in source.check.findings],
             }
-            for source in intake.sources
+            for source in loaded.sources
         ],
         'overruled': [
             {
@@ -640,7 +642,7 @@ def _data(
                 'place': finding.place,
                 'reason': finding.message,
             }
-            for source, finding in intake.overruled
+            for source, finding in loaded.overruled
         ],
         'unusable': [
             {
@@ -650,24 +652,24 @@ def _data(
                 'where': source.faults[0].where if source.faults else '',
                 'reason': source.reason,
             }
-            for source in intake.left_out
+            for source in loaded.left_out
         ],
     }
 
 
-def _in_spite_of(intake: Intake) -> str:
+def _in_spite_of(loaded: Loaded) -> str:
     """That recordings are used which the check refuses, as a sentence; empty if there are none."""
-    if not intake.overruled:
+    if not loaded.overruled:
         return ''
-    names = sorted({source.name for source, _ in intake.overruled})
-    codes = sorted({finding.code for _, finding in intake.overruled})
+    names = sorted({source.name for source, _ in loaded.overruled})
+    codes = sorted({finding.code for _, finding in loaded.overruled})
     which = names[0] if len(names) == 1 else f'{len(names)} recordings'
     return f' {which} used in spite of what the check finds: {", ".join(codes)}.'
 
 
-def _coverage(model: Model, trial: Trial) -> Facts:
-    channels = dict(zip(model.mechanism.outputs, trial.outputs.T, strict=True))
-    channels |= dict(zip(trial.input_names, trial.inputs.T, strict=True))
+def _coverage(model: Model, data_set: DataSet) -> Facts:
+    channels = dict(zip(model.mechanism.outputs, data_set.outputs.T, strict=True))
+    channels |= dict(zip(data_set.input_names, data_set.inputs.T, strict=True))
     return {
         name: [float(np.nanmin(values)), float(np.nanmax(values))]
         for name, values in channels.items()

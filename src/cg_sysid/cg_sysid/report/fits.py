@@ -107,7 +107,6 @@ def residuals(facts: Facts, drawn: Facts) -> Markup | None:
     )  # fmt: skip
 
 
-
 def _ordered(facts: Facts, drawn: Facts):
     """The output with the largest error first."""
     if not facts['gain']:

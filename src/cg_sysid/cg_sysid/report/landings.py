@@ -34,7 +34,8 @@ def picture(found: Facts) -> Markup | None:
     """Impulses along the ground and off it, as SVG."""
     size = max((math.hypot(*i['plastic']) for i in found['impulses']), default=0.0)
     known = [
-        i for i in found['impulses']
+        i
+        for i in found['impulses']
         if max(i['covariance'][0][0], i['covariance'][1][1]) < (SURE * size) ** 2
     ]
     if not known:

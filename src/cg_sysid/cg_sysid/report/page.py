@@ -41,9 +41,7 @@ def write_report(directory: str | Path, out: str | Path | None = None) -> Path:
     return path
 
 
-def render(
-    facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()
-) -> str:
+def render(facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()) -> str:
     """The page as text.
 
     Args:

@@ -23,9 +23,7 @@ LONGEST_SEGMENT = 2048
 Facts = dict[str, Any]
 
 
-def payload(
-    facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()
-) -> Facts:
+def payload(facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] = ()) -> Facts:
     """Everything that the scripts of the page draw."""
     channels = [
         {**channel, 'sigma': facts['noise_floor'].get(channel['name'])}

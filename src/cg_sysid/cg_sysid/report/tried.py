@@ -101,8 +101,12 @@ def _fall(c: Facts) -> str:
 def _meter(value: float | None, strongest: float) -> Markup:
     # Square root: a rival at half the evidence must still be seen beside a winner of thousands.
     share = math.sqrt(max(value or 0.0, 0.0) / strongest) if strongest > 0 else 0.0
-    return tag('span', tag('i', style=f'width:{100 * min(share, 1.0):.0f}%'), class_='meter',
-               aria_hidden='true')
+    return tag(
+        'span',
+        tag('i', style=f'width:{100 * min(share, 1.0):.0f}%'),
+        class_='meter',
+        aria_hidden='true',
+    )
 
 
 def parameters(facts: Facts) -> Markup | None:
@@ -111,11 +115,19 @@ def parameters(facts: Facts) -> Markup | None:
     fixed = [p for p in facts['parameters'] if p['fixed']]
     if facts['verdict'] == 'unusable' or not (moved or fixed):
         return None
-    head = tag('tr', column('parameter'), column('model file', class_='num'),
-               column('identified', class_='num'), column('unit'),
-               column('change in tolerances'), column('known from data', class_='num'))
-    table = wide('Identified parameters',
-                 tag('table', tag('thead', head), tag('tbody', [_row(p) for p in moved])))
+    head = tag(
+        'tr',
+        column('parameter'),
+        column('model file', class_='num'),
+        column('identified', class_='num'),
+        column('unit'),
+        column('change in tolerances'),
+        column('known from data', class_='num'),
+    )
+    table = wide(
+        'Identified parameters',
+        tag('table', tag('thead', head), tag('tbody', [_row(p) for p in moved])),
+    )
     return tag('section',
         tag('h2', 'Parameters', id='parameters-title'),
         tag('p', 'The grey band is what the model file believes, one tolerance either way; the '
@@ -217,5 +229,9 @@ def _cell(r: float | None, a: str, b: str) -> Markup:
     # Up to there the ink of the page keeps a contrast of 4.5, by day and by night.
     share = round(100 * min(abs(r), 1.0) ** 1.5 * DEEPEST)
     text = f'{r:+.2f}'.replace('-', '\u2212')
-    return tag('td', text, title=f'{a}, {b}: {text}',
-               style=f'background:color-mix(in srgb, {tone} {share}%, var(--panel))')
+    return tag(
+        'td',
+        text,
+        title=f'{a}, {b}: {text}',
+        style=f'background:color-mix(in srgb, {tone} {share}%, var(--panel))',
+    )

@@ -11,10 +11,10 @@ from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
-from cg_sysid.search import screening as glimpse
+from cg_sysid.search import excerpt as excerpt
 from cg_sysid.search.events import seek_events, undisturbed
 from cg_sysid.search.nuisance import Bounds, turning
 from cg_sysid.text import measured
@@ -30,7 +30,7 @@ ALIKE = 0.1  # relative difference of an effect's parameters there
 SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
 WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
 SETTLED = 1.2  # chi2/N at which nothing is left to find
-STRAINED = 4.0  # tolerances from which a number is not what the model file believes
+PRIOR_CONFLICT = 4.0  # tolerances from which a number is not what the model file believes
 TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none at all
 SURE = 5.0  # standard deviations from which an event of a record is not chance
 
@@ -44,10 +44,10 @@ class Task:
     Attributes:
         model: The base.
         effect: Effect and place.
-        events: What each trial has of its own, as far as the base knows it: name of the trial ->
+        events: What each data set has of its own, as far as the base knows it: its name ->
             full name -> value (unknowns.own_unknowns).
         bounds: Small faults that the base may have (imperfections.py).
-        leads: Go on from the best of these fits, the most promising first; without any from
+        warm_starts: Go on from the best of these fits, the most promising first; without any from
             the effect's own starts.
         iterations: Limit for whole records.
         thorough: Fit whole records down to the very bottom (identify.fit).
@@ -61,7 +61,7 @@ class Task:
     effect: tuple[str, str | None] | None = None
     events: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
-    leads: tuple[Fit, ...] = ()
+    warm_starts: tuple[Fit, ...] = ()
     iterations: int = ITERATIONS
     thorough: bool = False
     base: Fit | None = None
@@ -70,7 +70,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Look:
+class Screening:
     """A fit to a glimpse of the records: is a candidate worth a whole one?
 
     Attributes:
@@ -97,7 +97,7 @@ class Outcome:
     belief: float
     unknowns: int
     events: Mapping[str, Mapping[str, float]]
-    trials: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
+    data_sets: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
 
 
 def candidates_for(
@@ -144,34 +144,45 @@ def starts_of(name: str) -> list[dict[str, float]]:
     return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
 
 
-def look_at(task: Task, train: Sequence[Trial]) -> Look | str:
-    """Fit one candidate to a glimpse of the training trials, from each of its starts.
+def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
+    """Fit one candidate to a glimpse of the training data sets, from each of its starts.
 
     Returns:
         The look, or a sentence saying why there is none.
     """
     label, task = _label(task), _as_cause(task)
     late = TIME in LIBRARY[label.partition('@')[0]].extra_inputs
-    if eventful(task) or late or not glimpse.lengths(train):
-        return Look(label, task, np.nan)
+    if eventful(task) or late or not excerpt.lengths(train):
+        return Screening(label, task, np.nan)
     try:
-        leads = _first_seconds(task, train)
-        if task.first is not None and leads[0].normalised_error > task.first.normalised_error:
+        warm_starts = _first_seconds(task, train)
+        if (
+            task.first is not None
+            and warm_starts[0].normalised_error > task.first.normalised_error
+        ):
             model = next(_starting_models(task))
-            beyond = _look(task, model, train, start=started_from(task.first, model, task.bounds))
-            leads = tuple(sorted([beyond, *leads], key=lambda lead: lead.normalised_error))
-            leads = leads[:FOLLOWED]
+            beyond = _screened(
+                task, model, train, start=started_from(task.first, model, task.bounds)
+            )
+            warm_starts = tuple(
+                sorted([beyond, *warm_starts], key=lambda warm_start: warm_start.normalised_error)
+            )
+            warm_starts = warm_starts[:FOLLOWED]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
-    return Look(label, replace(task, leads=leads), leads[0].normalised_error)
+    return Screening(
+        label, replace(task, warm_starts=warm_starts), warm_starts[0].normalised_error
+    )
 
 
-def led_on(look: Look, task: Task) -> Look:
+def led_on(screening: Screening, task: Task) -> Screening:
     """The look for a task that has other small faults beside the same effect."""
     task = _as_cause(task)
     model = next(_starting_models(task))
-    leads = tuple(started_from(lead, model, task.bounds) for lead in look.task.leads)
-    return replace(look, task=replace(task, leads=leads))
+    warm_starts = tuple(
+        started_from(warm_start, model, task.bounds) for warm_start in screening.task.warm_starts
+    )
+    return replace(screening, task=replace(task, warm_starts=warm_starts))
 
 
 def _as_cause(task: Task) -> Task:
@@ -187,8 +198,8 @@ def _as_cause(task: Task) -> Task:
     return replace(task, bounds=others | shapes)
 
 
-def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> Outcome | str:
-    """Fit one candidate on the training trials and score it on the held-out ones.
+def try_candidate(task: Task, train: Sequence[DataSet], held: Sequence[DataSet]) -> Outcome | str:
+    """Fit one candidate on the training data sets and score it on the held-out ones.
 
     Returns:
         The outcome, or a sentence saying why there is none.
@@ -207,11 +218,12 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
             task.thorough, task.reach,
         )  # fmt: skip
         events = best.own_by_name(train) | held_score.own_by_name(held)
-        model = believing(best.model, task.model, label)
+        model = with_priors_of(best.model, task.model, label)
         residuals = tuple(
-            (predict(found.model, trial, motion, best.refinement) - trial.outputs) / trial.sigma
-            for found, trials in ((best, train), (held_score, held))
-            for trial, motion in zip(trials, found.motions, strict=True)
+            (predict(found.model, data_set, motion, best.refinement) - data_set.outputs)
+            / data_set.sigma
+            for found, data_sets in ((best, train), (held_score, held))
+            for data_set, motion in zip(data_sets, found.motions, strict=True)
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
@@ -224,7 +236,7 @@ def try_candidate(task: Task, train: Sequence[Trial], held: Sequence[Trial]) -> 
     )  # fmt: skip
 
 
-def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
+def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | str:
     """A thorough fit of an outcome's structure to all records, those held out among them.
 
     Rivals that have earned their place on held-out records are told apart by this: values that
@@ -232,30 +244,40 @@ def fit_to_all(o: Outcome, trials: Sequence[Trial]) -> Fit | str:
 
     Args:
         o: The outcome to go on from.
-        trials: Those of its training, then those held out.
+        data_sets: Those of its training, then those held out.
     """
     both = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     start = started_from(both, o.model, o.task.bounds)
     try:
-        return fit(o.model, trials, start=start, own=o.events, bounds=o.task.bounds, thorough=True,
-                   iterations=THOROUGH_ITERATIONS)  # fmt: skip
+        return fit(
+            o.model,
+            data_sets,
+            start=start,
+            own=o.events,
+            bounds=o.task.bounds,
+            thorough=True,
+            iterations=THOROUGH_ITERATIONS,
+        )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
 
 
 def shared_unknowns(found: Fit, bounds: Bounds) -> int:
-    """Number of values that all trials of a fit share, less small faults."""
+    """Number of values that all data sets of a fit share, less small faults."""
     return sum(u.name not in bounds for u in found.unknowns)
 
 
-def _own_count(found: Fit, trials: Sequence[Trial]) -> int:
-    """Values that these trials have of their own beyond their initial motions."""
-    several = {'record': len(trials), 'recording': len({trial.recording for trial in trials})}
+def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
+    """Values that these data sets have of their own beyond their initial motions."""
+    several = {
+        'record': len(data_sets),
+        'recording': len({data_set.recording for data_set in data_sets}),
+    }
     return sum(several[u.each] for u in found.own)
 
 
 def _surest(found: Fit, label: str) -> list[np.ndarray]:
-    """An effect's own values in the trials in which something surely happened."""
+    """An effect's own values in the data sets in which something surely happened."""
     count = len(found.own)
     place = [k for k, u in enumerate(found.own) if u.name.startswith(f'{label}.')]
     own = [motion[len(motion) - count :][place] for motion in found.motions]
@@ -285,7 +307,7 @@ def cost_of(task: Task) -> int:
     return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(name))
 
 
-def _best_fit(task: Task, train: Sequence[Trial]) -> Fit:
+def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     if eventful(task):
         return _event_fit(task, train)
     best = _own_fit(task, train)
@@ -323,19 +345,19 @@ def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
     )  # fmt: skip
 
 
-def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
-    model, leads = next(_starting_models(task)), task.leads
-    if not leads and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
-        leads = _first_seconds(task, train)
-    if not leads:
+def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
+    model, warm_starts = next(_starting_models(task)), task.warm_starts
+    if not warm_starts and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
+        warm_starts = _first_seconds(task, train)
+    if not warm_starts:
         return _whole(task, model, train, None, task.iterations)
     # The first seconds may mislead where the error has many minima: a resonance that is not
     # excited yet, a gap that is passed once.
-    best = _whole(task, _chosen(model, leads[0]), train, leads[0], FOLLOWING)
-    for lead in leads[1:]:
-        if best.normalised_error < SETTLED or lead.normalised_error > task.reach:
+    best = _whole(task, _chosen(model, warm_starts[0]), train, warm_starts[0], FOLLOWING)
+    for warm_start in warm_starts[1:]:
+        if best.normalised_error < SETTLED or warm_start.normalised_error > task.reach:
             break
-        other = _whole(task, _chosen(model, lead), train, lead, FOLLOWING)
+        other = _whole(task, _chosen(model, warm_start), train, warm_start, FOLLOWING)
         best = min(best, other, key=lambda found: found.normalised_error)
     left = task.iterations - FOLLOWING
     if best.converged or left < 1:
@@ -343,18 +365,18 @@ def _own_fit(task: Task, train: Sequence[Trial]) -> Fit:
     return _whole(task, _chosen(model, best), train, best, left)
 
 
-def _chosen(model: Model, lead: Fit) -> Model:
+def _chosen(model: Model, warm_start: Fit) -> Model:
     """The model with the choices that a lead has made for the last of its effects."""
-    stated = lead.model.values
+    stated = warm_start.model.values
     names = [f'{e.label}.{p.name}' for e in model.effects[-1:] for p in e.parameters if p.choice]
     return model.with_values({name: stated[name] for name in names if name in stated})
 
 
 def _whole(
-    task: Task, model: Model, train: Sequence[Trial], start: Fit | None, iterations: int
+    task: Task, model: Model, train: Sequence[DataSet], start: Fit | None, iterations: int
 ) -> Fit:
     """Fit whole records, all of them."""
-    start = glimpse.to_all(start, train) if start else None
+    start = excerpt.to_all(start, train) if start else None
     return fit(
         model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
         thorough=task.thorough, reach=task.reach,
@@ -368,25 +390,30 @@ def eventful(task: Task) -> bool:
     return any(p.each == 'record' for p in LIBRARY[task.effect[0]].parameters)
 
 
-def _first_seconds(task: Task, train: Sequence[Trial]) -> tuple[Fit, ...]:
+def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
     """Fits to a glimpse from every start: the best, and others that differ from it.
 
     From the task's leads, where it has some: looks at the same beside other small faults.
     """
     models = list(_starting_models(task))
     starts: list[Start] = [(model, None) for model in models]
-    if task.leads:
-        starts = [(_chosen(models[0], lead), lead) for lead in task.leads]
-    kept = _swept(models[0]) if not task.leads else []
-    looks = _looks(task, starts, train, kept)
+    if task.warm_starts:
+        starts = [(_chosen(models[0], warm_start), warm_start) for warm_start in task.warm_starts]
+    kept = _swept(models[0]) if not task.warm_starts else []
+    screenings = _all_screened(task, starts, train, kept)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
-        looks = _looks(task, [(model, None) for _, model in looks[:FOLLOWED]], train, [])
-    leads: list[Fit] = []
-    for look, model in looks:
-        if not any(one_minimum(look, lead, model.effects[-1].label) for lead in leads):
-            leads.append(look)
-    return tuple(leads[:FOLLOWED])
+        screenings = _all_screened(
+            task, [(model, None) for _, model in screenings[:FOLLOWED]], train, []
+        )
+    warm_starts: list[Fit] = []
+    for screening, model in screenings:
+        if not any(
+            one_minimum(screening, warm_start, model.effects[-1].label)
+            for warm_start in warm_starts
+        ):
+            warm_starts.append(screening)
+    return tuple(warm_starts[:FOLLOWED])
 
 
 def one_minimum(a: Fit, b: Fit, label: str) -> bool:
@@ -401,9 +428,9 @@ def one_minimum(a: Fit, b: Fit, label: str) -> bool:
     return near and bool(alike)
 
 
-def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
+def _event_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     """An effect of which every record has its own size and instant."""
-    best = task.leads[0] if task.leads else None
+    best = task.warm_starts[0] if task.warm_starts else None
     settled = best or fit(task.model, train, own=task.events, bounds=task.bounds)
     nothing = settled.normalised_error
     settled = best or undisturbed(task.model, train, task.bounds) or settled
@@ -420,20 +447,20 @@ def _event_fit(task: Task, train: Sequence[Trial]) -> Fit:
         if best.normalised_error < SETTLED:
             return fit(model, train, start=best, bounds=task.bounds)
     assert best is not None
-    found = bool(task.leads) or best.normalised_error > WORTH_SEEKING * nothing
+    found = bool(task.warm_starts) or best.normalised_error > WORTH_SEEKING * nothing
     return replace(best, converged=found)
 
 
-def _look(
+def _screened(
     task: Task,
     model: Model,
-    train: Sequence[Trial],
+    train: Sequence[DataSet],
     only: Sequence[str] | None = None,
     start: Fit | None = None,
-    length: float = glimpse.LENGTHS_S[0],
+    length: float = excerpt.LENGTHS_S[0],
 ) -> Fit:
     """A fit to a glimpse of the records: as long as the base's own look, if there is one."""
-    few = [train[i] for i in glimpse.few(train)]
+    few = [train[i] for i in excerpt.few(train)]
     return fit(
         model, few, only, horizon=task.first.horizon if task.first else length,
         iterations=SCREEN_ITERATIONS, start=start,
@@ -441,16 +468,16 @@ def _look(
     )  # fmt: skip
 
 
-def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
+def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
     """Fit of a task's base to a glimpse, from its fit to whole records; None without.
 
     To so many seconds that something is wrong there: where nothing is, nothing can help.
     """
     found = None
-    start = glimpse.to_few(task.base, train) if task.base else None
-    for length in glimpse.lengths(train):
+    start = excerpt.to_few(task.base, train) if task.base else None
+    for length in excerpt.lengths(train):
         try:
-            found = _look(task, task.model, train, start=start, length=length)
+            found = _screened(task, task.model, train, start=start, length=length)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
             break
         if found.normalised_error > SETTLED:
@@ -458,16 +485,16 @@ def first_seconds(task: Task, train: Sequence[Trial]) -> Fit | None:
     return found
 
 
-def deeper(task: Task, lead: Fit, train: Sequence[Trial]) -> Fit | None:
+def deeper(task: Task, warm_start: Fit, train: Sequence[DataSet]) -> Fit | None:
     """Fit of a task's base to a glimpse from where an effect more has led its numbers.
 
     Returns:
         The fit, if it lies clearly deeper than the base's own; None otherwise.
     """
     assert task.first is not None
-    start = started_from(lead, task.model, task.bounds)
+    start = started_from(warm_start, task.model, task.bounds)
     try:
-        found = _look(task, task.model, train, start=start)
+        found = _screened(task, task.model, train, start=start)
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
         return None
     return found if SAME * found.normalised_error < task.first.normalised_error else None
@@ -479,23 +506,23 @@ def _swept(model: Model) -> list[str]:
     return [f'{own.label}.{p.name}' for p in own.parameters if p.swept]
 
 
-def _looks(
-    task: Task, starts: Sequence[Start], train: Sequence[Trial], kept: Sequence[str]
+def _all_screened(
+    task: Task, starts: Sequence[Start], train: Sequence[DataSet], kept: Sequence[str]
 ) -> list[tuple[Fit, Model]]:
     """Short fits from each start and where they lead, best first; `kept` stay as they are."""
-    looks = []
+    screenings = []
     for model, start in starts:
         moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
         only = [name for name in moved if name not in kept] if kept else None
         try:
-            look = _look(task, model, train, only, start)
-            found = {u.name: v for u, v in zip(look.unknowns, look.values, strict=True)}
-            looks.append((look, model.with_values(found)))
+            screening = _screened(task, model, train, only, start)
+            found = {u.name: v for u, v in zip(screening.unknowns, screening.values, strict=True)}
+            screenings.append((screening, model.with_values(found)))
         except IdentificationError as error:
             failure = error
-    if not looks:
+    if not screenings:
         raise failure
-    return sorted(looks, key=lambda pair: pair[0].normalised_error)
+    return sorted(screenings, key=lambda pair: pair[0].normalised_error)
 
 
 def _starting_models(task: Task):
@@ -517,18 +544,21 @@ def _label(task: Task) -> str:
     return LIBRARY[name](task.model.mechanism, at).label
 
 
-def believing(fitted: Model, base: Model, label: str) -> Model:
+def with_priors_of(fitted: Model, base: Model, label: str) -> Model:
     """The fitted structure with the base's numbers and beliefs; added effects keep their values.
 
     What a fit found is a start for the next one, not a belief.
     """
-    added = {n: replace(q, tolerance=None) for n, q in fitted.quantities.items()
-             if n not in base.quantities or n.startswith(f'{label}.')}
+    added = {
+        n: replace(q, tolerance=None)
+        for n, q in fitted.quantities.items()
+        if n not in base.quantities or n.startswith(f'{label}.')
+    }
     return replace(base, effects=fitted.effects, quantities={**base.quantities, **added})
 
 
 def chi2(o: Outcome) -> float:
-    """Squared error over noise variance, training and held-out trials together."""
+    """Squared error over noise variance, training and held-out data sets together."""
     return o.train.squares + o.held.squares
 
 
@@ -548,7 +578,7 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
         if p.choice and p.name not in shared and chosen != p.starts[0]:
             shared[p.name] = chosen, 0.0, p.unit
     events = events_of(o, label)
-    fitted = [events[name] for name in o.trials[0] if name in events]
+    fitted = [events[name] for name in o.data_sets[0] if name in events]
     surest = max(fitted or events.values(), key=_sureness, default={})
     return {**surest, **shared}
 
@@ -569,7 +599,7 @@ def events_of(o: Outcome, label: str) -> dict[str, dict[str, tuple[float, float,
     The intervals of held-out records take the shared numbers for certain; `events_in` of a fit to
     all records (fit_to_all) does not.
     """
-    train, held = o.trials
+    train, held = o.data_sets
     return {**events_in(o.train, train, label), **events_in(o.held, held, label)}
 
 
@@ -600,14 +630,14 @@ def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
     return parameters_of(o, o.label)
 
 
-def strained(o: Outcome) -> dict[str, float]:
+def prior_conflicts(o: Outcome) -> dict[str, float]:
     """Parameters that the fit puts far from what the file believes: tolerances away."""
     away = {
         u.name: abs(u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance
         for u, v in zip(o.train.unknowns, o.train.values, strict=True)
         if np.isfinite(u.tolerance) and u.name not in o.task.bounds
     }
-    return {name: tolerances for name, tolerances in away.items() if tolerances > STRAINED}
+    return {name: tolerances for name, tolerances in away.items() if tolerances > PRIOR_CONFLICT}
 
 
 def too_small(o: Outcome) -> list[str]:
@@ -660,14 +690,19 @@ def at_edge(o: Outcome) -> list[str]:
     """
     found = []
     kind = LIBRARY.get(o.label.partition('@')[0])
-    optional = {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower
-                } if kind else set()
+    optional = (
+        {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower}
+        if kind
+        else set()
+    )
     shares = {f'{o.label}.{p.name}' for p in kind.parameters if p.bounded} if kind else set()
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
         if u.name in {*o.task.bounds, *shares} or not u.name.startswith(f'{o.label}.'):
             continue
-        low, high, at = (u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
-                         for x in (u.lower, u.upper, v))
+        low, high, at = (
+            u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
+            for x in (u.lower, u.upper, v)
+        )
         # Ranges suit machines of all sizes: a small value is not yet an edge.
         margin = 1e-3 * (high - low)
         if not u.logarithmic:

@@ -16,8 +16,8 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
-from cg_sysid.identification.data_set import Trial, pieces
-from cg_sysid.identification.identify import Fit, fit, in_trial, score
+from cg_sysid.identification.data_set import DataSet, pieces
+from cg_sysid.identification.identify import Fit, fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, awake, own_unknowns
 from cg_sysid.search.nuisance import Bounds
 
@@ -32,37 +32,41 @@ FOLLOWED = 3  # peaks from which a fit goes on
 
 
 def seek_events(
-    model: Model, trials: Sequence[Trial], label: str,
+    model: Model,
+    data_sets: Sequence[DataSet],
+    label: str,
     known: Mapping[str, Mapping[str, float]] | None = None,
     elsewhere: Sequence[np.ndarray] = (),
 ) -> dict[str, dict[str, float]]:
-    """Trial name -> full name -> guess of its own value.
+    """DataSet name -> full name -> guess of its own value.
 
     Args:
         model: Has an effect of which every record has a size and an instant; its other values
             are taken as they are.
-        trials: Each is looked at by itself.
+        data_sets: Each is looked at by itself.
         label: Of the effect.
-        known: What else each trial has of its own, and as far as it is known this.
-        elsewhere: Sizes and instants in other trials; they may be those of these as well.
+        known: What else each data set has of its own, and as far as it is known this.
+        elsewhere: Sizes and instants in other data sets; they may be those of these as well.
     """
     names = [u.name for u in own_unknowns(model) if u.name.startswith(f'{label}.')]
     known = known or {}
-    if trials and all(set(names) <= set(known.get(trial.name, ())) for trial in trials):
-        return {trial.name: dict(known[trial.name]) for trial in trials}
+    if data_sets and all(
+        set(names) <= set(known.get(data_set.name, ())) for data_set in data_sets
+    ):
+        return {data_set.name: dict(known[data_set.name]) for data_set in data_sets}
     seeking = _Seeking(model, names, known)
-    guesses = [seeking.alone(trial) for trial in trials]
+    guesses = [seeking.alone(data_set) for data_set in data_sets]
     # What happened in one record may have happened at the same time in another.
     surest = sorted(guesses, key=lambda g: g.error / g.quiet)[:FOLLOWED]
     others = [*elsewhere, *(g.event for g in surest if g.error < g.quiet)]
-    guesses = [seeking.follow(t, g, others) for t, g in zip(trials, guesses, strict=True)]
+    guesses = [seeking.follow(t, g, others) for t, g in zip(data_sets, guesses, strict=True)]
     return {
-        trial.name: seeking.beside(trial, guess.event)
-        for trial, guess in zip(trials, guesses, strict=True)
+        data_set.name: seeking.beside(data_set, guess.event)
+        for data_set, guess in zip(data_sets, guesses, strict=True)
     }
 
 
-def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | None:
+def undisturbed(model: Model, data_sets: Sequence[DataSet], bounds: Bounds) -> Fit | None:
     """Fit of a model to those pieces of the records in which nothing happens.
 
     An event that the model does not have pulls at all its numbers, and with such numbers it is
@@ -77,7 +81,7 @@ def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | 
     # which a first, spoilt fit loses.
     if own_unknowns(model) or any(TIME in effect.extra_inputs for effect in model.effects):
         return None
-    whole = [piece for t in trials for _, piece in pieces(model.mechanism, t, PIECE_S)]
+    whole = [piece for t in data_sets for _, piece in pieces(model.mechanism, t, PIECE_S)]
     kept, found = whole, None
     try:
         for _ in range(TRIMMINGS):
@@ -91,7 +95,7 @@ def undisturbed(model: Model, trials: Sequence[Trial], bounds: Bounds) -> Fit | 
     return found if spoilt and quiet == QUIET else None
 
 
-def _piece_errors(model: Model, found: Sequence[Trial]) -> np.ndarray:
+def _piece_errors(model: Model, found: Sequence[DataSet]) -> np.ndarray:
     """chi2/N of each piece."""
     fitted = score(model, found)
     return np.nansum(fitted.mse * fitted.count, axis=1) / fitted.count.sum(axis=1)
@@ -99,7 +103,7 @@ def _piece_errors(model: Model, found: Sequence[Trial]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Guess:
-    """Size and instant in a trial, and its error (chi2/N) with the event and without."""
+    """Size and instant in a data set, and its error (chi2/N) with the event and without."""
 
     event: np.ndarray
     error: float
@@ -108,66 +112,66 @@ class _Guess:
 
 @dataclass(frozen=True)
 class _Seeking:
-    """A search of single trials for size and instant, beside what else is known of each."""
+    """A search of single data sets for size and instant, beside what else is known of each."""
 
     model: Model
     names: Sequence[str]
     known: Mapping[str, Mapping[str, float]]
 
-    def beside(self, trial: Trial, event: np.ndarray) -> dict[str, float]:
-        """All that the trial has of its own, by name."""
+    def beside(self, data_set: DataSet, event: np.ndarray) -> dict[str, float]:
+        """All that the data set has of its own, by name."""
         named = dict(zip(self.names, map(float, event), strict=True))
-        return {**self.known.get(trial.name, {}), **named}
+        return {**self.known.get(data_set.name, {}), **named}
 
-    def alone(self, trial: Trial) -> _Guess:
-        """The best that this trial alone knows."""
+    def alone(self, data_set: DataSet) -> _Guess:
+        """The best that this data set alone knows."""
         nothing = np.array([0.0, self.model.values[self.names[1]]])
-        quiet = self._fit(trial, nothing, 8)
+        quiet = self._fit(data_set, nothing, 8)
         guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
-        found = quiet.own_by_name([trial])[trial.name]
-        _, motion = in_trial(awake(self.model), quiet.motions[0])
+        found = quiet.own_by_name([data_set])[data_set.name]
+        _, motion = in_data_set(awake(self.model), quiet.motions[0])
         others = {name: value for name, value in found.items() if name not in self.names}
-        starts = _small_events(self.model.with_values(others), trial, motion, self.names)
-        return self.follow(trial, guess, starts)
+        starts = _small_events(self.model.with_values(others), data_set, motion, self.names)
+        return self.follow(data_set, guess, starts)
 
-    def follow(self, trial: Trial, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
-        """The best of a guess and the fits of this trial alone from each start."""
+    def follow(self, data_set: DataSet, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
+        """The best of a guess and the fits of this data set alone from each start."""
         for start in starts:
             try:
-                found = self._fit(trial, start, 16)
+                found = self._fit(data_set, start, 16)
             except IdentificationError:
                 continue
-            own = found.own_by_name([trial])[trial.name]
+            own = found.own_by_name([data_set])[data_set.name]
             event = np.array([own[name] for name in self.names])
-            inside = 0.0 <= event[1] - trial.since <= trial.duration
+            inside = 0.0 <= event[1] - data_set.since <= data_set.duration
             if inside and found.normalised_error < guess.error:
                 guess = replace(guess, event=event, error=found.normalised_error)
         return guess
 
-    def _fit(self, trial: Trial, event: np.ndarray, iterations: int) -> Fit:
-        own = {trial.name: self.beside(trial, event)}
-        return fit(self.model, [trial], only=(), own=own, iterations=iterations)
+    def _fit(self, data_set: DataSet, event: np.ndarray, iterations: int) -> Fit:
+        own = {data_set.name: self.beside(data_set, event)}
+        return fit(self.model, [data_set], only=(), own=own, iterations=iterations)
 
 
 def _small_events(
-    model: Model, trial: Trial, motion: np.ndarray, names: Sequence[str]
+    model: Model, data_set: DataSet, motion: np.ndarray, names: Sequence[str]
 ) -> list[np.ndarray]:
     """Sizes and instants of the events that lower the error most, best first."""
-    compiled = compile_model(awake(model), trial.setup)
+    compiled = compile_model(awake(model), data_set.setup)
     size, instant = (compiled.parameter_names.index(name) for name in names)
-    p = parameter_vector(model, trial.setup)
+    p = parameter_vector(model, data_set.setup)
     p[size] = 0.0
-    u = trial.inputs_for(compiled.input_names)
+    u = data_set.inputs_for(compiled.input_names)
     m2 = len(motion)
     x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
     s0 = np.column_stack([by_motion, np.zeros(compiled.nx)])
     column = np.where(np.array(compiled.free) == names[0], m2, -1)
-    grid = _instants(model.with_values({names[0]: 0.0}), trial)
+    grid = _instants(model.with_values({names[0]: 0.0}), data_set)
     gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
     for k, t in enumerate(grid):
-        p[instant] = trial.since + t
+        p[instant] = data_set.since + t
         normal, _, _ = compiled.normal(
-            trial.time, u, x0, s0, p, column, trial.outputs, 1 / trial.sigma
+            data_set.time, u, x0, s0, p, column, data_set.outputs, 1 / data_set.sigma
         )
         h, g = normal.hessian, normal.gradient
         # What the initial motion could do as well does not count.
@@ -177,16 +181,16 @@ def _small_events(
             gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
     peaks, _ = scipy.signal.find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
-    return [np.array([sizes[k], trial.since + grid[k]]) for k in order[:FOLLOWED]]
+    return [np.array([sizes[k], data_set.since + grid[k]]) for k in order[:FOLLOWED]]
 
 
-def _instants(model: Model, trial: Trial) -> np.ndarray:
+def _instants(model: Model, data_set: DataSet) -> np.ndarray:
     """Instants in s from the first row, at which something may have happened.
 
     All, or those about spoilt pieces.
     """
-    grid = np.arange(0.0, trial.duration, GRID_S)
-    found = pieces(model.mechanism, trial, PIECE_S)
+    grid = np.arange(0.0, data_set.duration, GRID_S)
+    found = pieces(model.mechanism, data_set, PIECE_S)
     try:
         errors = _piece_errors(model, [piece for _, piece in found])
     except IdentificationError:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
 from cg_sysid.search.candidates import (
@@ -16,8 +16,8 @@ from cg_sysid.search.candidates import (
     at_edge,
     chi2,
     own_parameters,
+    prior_conflicts,
     shared_unknowns,
-    strained,
     too_small,
     undetermined_size,
 )
@@ -51,7 +51,7 @@ BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
 
 
 @dataclass(frozen=True)
-class Contest:
+class Comparison:
     """All candidates on top of one base, judged, best first.
 
     Attributes:
@@ -82,7 +82,7 @@ class Contest:
         ]
         return simpler[0] if simpler else able[0]
 
-    def less(self, label: str, reason: str) -> 'Contest':
+    def less(self, label: str, reason: str) -> 'Comparison':
         """The contest with the candidate of that label turned down after all."""
         return replace(self, ranked=tuple(
             (replace(c, reason=reason) if c.label == label else c, o) for c, o in self.ranked
@@ -108,21 +108,21 @@ class Contest:
         ]
 
 
-class Jury:
+class ModelSelection:
     """Judges outcomes that were fitted on one split of records."""
 
-    def __init__(self, train: Sequence[Trial], held: Sequence[Trial]):
-        trials = (*train, *held)
+    def __init__(self, train: Sequence[DataSet], held: Sequence[DataSet]):
+        data_sets = (*train, *held)
         self.first_held = len(train)
-        self.trials = trials
-        self.steps = [float(np.median(np.diff(trial.time))) for trial in trials]
-        judged = sum(trial.duration for trial in held)
+        self.data_sets = data_sets
+        self.steps = [float(np.median(np.diff(data_set.time))) for data_set in data_sets]
+        judged = sum(data_set.duration for data_set in held)
         block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
-    def contest(
+    def comparison(
         self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | str] = ()
-    ) -> Contest:
+    ) -> Comparison:
         """Rank outcomes that extend a base.
 
         Args:
@@ -132,7 +132,7 @@ class Jury:
                 there is none. If all went through they rank the outcomes.
         """
         if not outcomes:
-            return Contest(base, (), 2.0, MARGIN)
+            return Comparison(base, (), 2.0, MARGIN)
         leader = min([base, *outcomes], key=chi2)
         independent = independent_samples(leader.residuals, self.steps)
         reference = _evidence(base, independent)
@@ -156,7 +156,7 @@ class Jury:
         if at_noise(base) and not self.imitated(base):
             # Beliefs decide, and those are rough: whatever relieves them is a rival.
             margin = float('inf')
-        return Contest(base, tuple(ranked), independent, margin)
+        return Comparison(base, tuple(ranked), independent, margin)
 
     def judge(
         self, base: Outcome, o: Outcome, gained: float, independent: float = float('inf')
@@ -172,30 +172,32 @@ class Jury:
         imitated = self.imitated(base)
         if at_noise(base) and not imitated:
             # No error is left to explain, but numbers that nobody believes.
-            if strained(o) or not at_noise(o):
+            if prior_conflicts(o) or not at_noise(o):
                 reasons.append('leaves numbers far from what the model file believes')
         elif significance < SIGNIFICANT or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
         elif (
             explained < MATERIAL
-            and not (strained(base) and not strained(o))
+            and not (prior_conflicts(base) and not prior_conflicts(o))
             and not (imitated and self._white(o))
         ):
-            reasons.append(f'explains {explained:.2f} noise standard deviations, '
-                           f'{MATERIAL:g} needed')
+            reasons.append(
+                f'explains {explained:.2f} noise standard deviations, {MATERIAL:g} needed'
+            )
         each = _own_values(o) / len(self.steps)
         eventful = any(u.each == 'record' for u in o.train.own)
         if eventful and independent < SAYS_MORE * each * len(self.steps):
             # With a push of its own a short record is matched whatever is wrong, held out or not.
             reasons.append(
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
-                f'judge {each:.0f} values of each record\'s own'
+                f"judge {each:.0f} values of each record's own"
             )
         left = above_noise(o) / max(above_noise(base), 1e-300)
         if eventful and not at_noise(o) and left > MISHAP:
             # A push in every record takes the edge off whatever is wrong all the time.
-            reasons.append(f'leaves {100 * left:.0f} % of the error, at most '
-                           f'{100 * MISHAP:.0f} % allowed')
+            reasons.append(
+                f'leaves {100 * left:.0f} % of the error, at most {100 * MISHAP:.0f} % allowed'
+            )
         own = own_parameters(o)
         reasons += at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
@@ -225,7 +227,7 @@ class Jury:
         values = {n.removeprefix(prefix): v for n, v in o.train.model.values.items()
                   if n.startswith(prefix)}  # fmt: skip
         commands = o.model.mechanism.inputs
-        torque = max(float(np.abs(t.inputs_for(commands)).max()) for t in self.trials)
+        torque = max(float(np.abs(t.inputs_for(commands)).max()) for t in self.data_sets)
         reason = effect.implausible(values, torque)
         return [reason] if reason else []
 
@@ -239,7 +241,7 @@ class Jury:
 
     def nothing_material(self, o: Outcome) -> bool:
         """True if so little is left that nothing could explain MATERIAL of it."""
-        if strained(o) or self.imitated(o):
+        if prior_conflicts(o) or self.imitated(o):
             return False  # beliefs decide, or whiteness
         return bool(per_output(o.held).max() < QUIETEST + MATERIAL**2)
 
@@ -249,7 +251,7 @@ class Jury:
         It has to explain MATERIAL in one output of the records held out. Of those that it is
         fitted to it explains about as much; where they are almost at the noise, a part of that.
         """
-        if strained(base) or self.imitated(base):
+        if prior_conflicts(base) or self.imitated(base):
             return np.inf
         count = base.train.count.sum(axis=0)
         least = MATERIAL**2 * float(count.min() / count.sum())
@@ -294,7 +296,7 @@ def _own_values(o: Outcome) -> int:
 
 def settled(o: Outcome) -> bool:
     """True if nothing is left to explain: no error, and no numbers that nobody believes."""
-    return at_noise(o) and not strained(o)
+    return at_noise(o) and not prior_conflicts(o)
 
 
 def at_noise(o: Outcome) -> bool:
@@ -303,7 +305,7 @@ def at_noise(o: Outcome) -> bool:
 
 
 def samples(o: Outcome) -> float:
-    """Number of samples, training and held-out trials together."""
+    """Number of samples, training and held-out data sets together."""
     return float(o.train.count.sum() + o.held.count.sum())
 
 

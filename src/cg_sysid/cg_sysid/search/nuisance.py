@@ -31,7 +31,7 @@ NEXT_TO_NOTHING = 1e-3  # of the largest size: at its neutral value an effect ta
 Bounds = Mapping[str, float]
 
 
-def with_imperfections(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bounds]:
+def with_nuisances(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bounds]:
     """The model with the small faults that it does not state, and how large each may be.
 
     Returns:
@@ -90,6 +90,6 @@ def faults_among(model: Model, bounds: Bounds) -> Bounds:
     return {n: b for n, b in bounds.items() if n in declared and not declared[n].leeway}
 
 
-def imperfect(model: Model, bounds: Bounds) -> set[str]:
+def nuisances(model: Model, bounds: Bounds) -> set[str]:
     """Labels of the effects of a model that are small faults."""
     return {name.rpartition('.')[0] for name in faults_among(model, bounds)}

@@ -72,5 +72,5 @@ def contains(label: str, other: str) -> bool:
 
 
 def per_output(fit: Fit) -> np.ndarray:
-    """chi2/N of each output over all trials; 0 for an output without samples."""
+    """chi2/N of each output over all data sets; 0 for an output without samples."""
     return (fit.mse * fit.count).sum(axis=0) / np.maximum(fit.count.sum(axis=0), 1)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cg_sysid.search.candidates import Look, Outcome, Task
-from cg_sysid.search.nuisance import imperfect
+from cg_sysid.search.candidates import Outcome, Screening, Task
+from cg_sysid.search.nuisance import nuisances
 from cg_sysid.text import listed, off_by
 
 NAMED = 3  # candidates that a sentence names
@@ -77,7 +77,7 @@ class SoFar:
 
     def __init__(self, stated: frozenset[str]):
         self._stated = stated
-        self._looks: dict[Base, dict[str, Look]] = {}
+        self._all_screened: dict[Base, dict[str, Screening]] = {}
         self._outcomes: dict[Base, dict[str, Outcome]] = {}
         # By what they add to the nominal model; first looks come after fits to whole records.
         self._standings: dict[str, tuple[bool, float]] = {}
@@ -91,10 +91,10 @@ class SoFar:
                 if before is None or result.train.squares < before.train.squares:
                     known[result.label] = result
             added = frozenset(effect.label for effect in result.model.effects)
-            added -= self._stated | imperfect(result.model, result.task.bounds)
+            added -= self._stated | nuisances(result.model, result.task.bounds)
             self._lead(False, result.train.normalised_error, added)
-        elif isinstance(result, Look):
-            self._looks.setdefault(base_of(result.task), {})[result.label] = result
+        elif isinstance(result, Screening):
+            self._all_screened.setdefault(base_of(result.task), {})[result.label] = result
             if result.error > 0:
                 added = frozenset(effect.label for effect in result.task.model.effects)
                 self._lead(True, result.error, (added - self._stated) | {result.label})
@@ -118,9 +118,9 @@ class SoFar:
         """Candidates on top of a base that were fitted to whole records."""
         return list(self._outcomes.get(base_of(base), {}).values())
 
-    def looked_at(self, base: Task) -> list[Look]:
+    def screened(self, base: Task) -> list[Screening]:
         """Candidates on top of a base that were looked at."""
-        return list(self._looks.get(base_of(base), {}).values())
+        return list(self._all_screened.get(base_of(base), {}).values())
 
     def ranking(self, base: Task) -> tuple[Standing, ...]:
         """Candidates on top of a base, the best first; whole fits before first looks."""
@@ -128,12 +128,13 @@ class SoFar:
             o.label: Standing(o.label, o.train.normalised_error**0.5, True)
             for o in self.fitted(base)
         }
-        looks = [
-            Standing(look.label, look.error**0.5, False)
-            for look in self.looked_at(base) if look.error >= 0 and look.label not in fitted
-        ]  # fmt: skip
+        screenings = [
+            Standing(screening.label, screening.error**0.5, False)
+            for screening in self.screened(base)
+            if screening.error >= 0 and screening.label not in fitted
+        ]
         return tuple(
-            standing for some in (fitted.values(), looks)
+            standing for some in (fitted.values(), screenings)
             for standing in sorted(some, key=lambda s: s.in_noise)
         )  # fmt: skip
 

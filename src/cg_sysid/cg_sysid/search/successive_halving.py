@@ -14,26 +14,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from cg_sysid.identification.data_set import Trial
+from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.search.candidates import (
     FOLLOWED,
     SAME,
     SETTLED,
-    Look,
     Outcome,
+    Screening,
     Task,
     chi2,
     cost_of,
     deeper,
     eventful,
     led_on,
-    look_at,
+    screen,
     try_candidate,
 )
 from cg_sysid.search.events import undisturbed
 from cg_sysid.search.model_selection import samples
-from cg_sysid.search.nuisance import imperfect
+from cg_sysid.search.nuisance import nuisances
 
 log = logging.getLogger(__name__)
 
@@ -55,57 +55,61 @@ CarryOut = Callable[[Callable, list[tuple], str], list]
 Effects = Sequence[tuple[str, str | None]]
 
 
-class Race:
-    """Fits of candidates on the trials of one diagnosis.
+class SuccessiveHalving:
+    """Fits of candidates on the data sets of one diagnosis.
 
     Args:
-        train: Trials to fit.
-        held: Trials held out.
+        train: Data sets to fit.
+        held: Data sets held out.
         carry_out: Does independent pieces of work: (function, arguments of each, what) -> results.
     """
 
-    def __init__(self, train: Sequence[Trial], held: Sequence[Trial], carry_out: CarryOut):
+    def __init__(self, train: Sequence[DataSet], held: Sequence[DataSet], carry_out: CarryOut):
         self.train, self.held, self.carry_out = train, held, carry_out
-        self.looks: dict[tuple, Look | str] = {}  # by _structure
+        self.screenings: dict[tuple, Screening | str] = {}  # by _structure
 
     def fit(self, tasks: Sequence[Task], what: str) -> list[Outcome | str]:
         """Fits to whole records, in the order of the tasks; a sentence for one that failed."""
         return self.carry_out(try_candidate, [(t, self.train, self.held) for t in tasks], what)
 
-    def look(self, tasks: Sequence[Task], what: str) -> list[Look]:
+    def screen(self, tasks: Sequence[Task], what: str) -> list[Screening]:
         """First looks, without those that failed; what was looked at is known.
 
         Those at the same beside other small faults lead the way.
         """
-        new = [task for task in tasks if _structure(task) not in self.looks]
+        new = [task for task in tasks if _structure(task) not in self.screenings]
         before = [self._known_beside(task) for task in new]
-        led = [replace(task, leads=known.task.leads) if known else task
+        led = [replace(task, warm_starts=known.task.warm_starts) if known else task
                for task, known in zip(new, before, strict=True)]  # fmt: skip
-        looks = self.carry_out(look_at, [(task, self.train) for task in led], what)
-        for task, look in zip(new, looks, strict=True):
-            self.looks[_structure(task)] = look
-            if isinstance(look, str):
-                log.info('%s: %s', task.effect, look)
-        known = [self.looks[_structure(task)] for task in tasks]
-        return [look for look in known if isinstance(look, Look)]
+        screenings = self.carry_out(screen, [(task, self.train) for task in led], what)
+        for task, screening in zip(new, screenings, strict=True):
+            self.screenings[_structure(task)] = screening
+            if isinstance(screening, str):
+                log.info('%s: %s', task.effect, screening)
+        known = [self.screenings[_structure(task)] for task in tasks]
+        return [screening for screening in known if isinstance(screening, Screening)]
 
-    def look_beside(self, tasks: Sequence[Task], what: str) -> list[Look]:
+    def screen_beside(self, tasks: Sequence[Task], what: str) -> list[Screening]:
         """First looks, or what is known of the same effects beside other small faults."""
-        known = [look for task in tasks if (look := self._known_beside(task))]
-        effects = {look.task.effect for look in known}
-        return [*known, *self.look([t for t in tasks if t.effect not in effects], what)]
+        known = [screening for task in tasks if (screening := self._known_beside(task))]
+        effects = {screening.task.effect for screening in known}
+        return [*known, *self.screen([t for t in tasks if t.effect not in effects], what)]
 
-    def _known_beside(self, task: Task) -> Look | None:
+    def _known_beside(self, task: Task) -> Screening | None:
         """A look at the same effect on the same causes, as one for this task."""
-        for look in self.looks.values():
-            if not isinstance(look, Look) or not look.task.leads:
+        for screening in self.screenings.values():
+            if not isinstance(screening, Screening) or not screening.task.warm_starts:
                 continue
-            if look.task.effect == task.effect and _causes(look.task) == _causes(task):
-                return led_on(look, task)
+            if screening.task.effect == task.effect and _causes(screening.task) == _causes(task):
+                return led_on(screening, task)
         return None
 
     def run(
-        self, base: Task, effects: Effects, what: str, beaten: float = np.inf,
+        self,
+        base: Task,
+        effects: Effects,
+        what: str,
+        beaten: float = np.inf,
         earned: float = np.inf,
     ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
@@ -124,33 +128,41 @@ class Race:
         events = [task for task in tasks if eventful(task)]
         others = [task for task in tasks if not eventful(task)]
         looking = f'first look at {what}'
-        looks = self.look(_light(others), looking)
+        screenings = self.screen(_light(others), looking)
         found: dict[str, Outcome] = {}
-        if events and _nothing_helps(base, looks) and self._happened(base, what):
+        if events and _nothing_helps(base, screenings) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
-        known = min(NEAR * min(_best(found), _smallest(looks)), AS_GOOD * beaten)
-        reach = min(known, worth_having(_clear(_smallest(looks), base.first), base.first))
+        known = min(NEAR * min(_best(found), _smallest(screenings)), AS_GOOD * beaten)
+        reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
-        looks += self.look(_longest_first(heavy), looking)
+        screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
-        for limit in (_favoured(_smallest(looks)), np.inf):
+        for limit in (_favoured(_smallest(screenings)), np.inf):
             best = _best(found)
             reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base), earned)
             fewest = FEWEST if np.isinf(beaten) else 0
-            heat = [look for look in _worth_more(looks, reach, base.first, fewest)
-                    if look.label not in tried and _known(look) <= limit]  # fmt: skip
-            tried.update(look.label for look in heat)
-            found |= self._fitted([replace(look.task, reach=reach) for look in heat], what)
+            heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
+                    if screening.label not in tried and _known(screening) <= limit]  # fmt: skip
+            tried.update(screening.label for screening in heat)
+            found |= self._fitted(
+                [replace(screening.task, reach=reach) for screening in heat], what
+            )
         # To seek events in every record takes long: first what explains most of the error.
         best = min(_best(found), beaten)
         if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
             found |= self._fitted(events, f'{what}, events')
         found |= self._in_more_depth(found, base.base, beaten, earned, what)
-        return list(found.values()), [look.label for look in looks if look.label not in tried]
+        return list(found.values()), [
+            screening.label for screening in screenings if screening.label not in tried
+        ]
 
     def _in_more_depth(
-        self, found: Mapping[str, Outcome], base: Fit | None, beaten: float, earned: float,
+        self,
+        found: Mapping[str, Outcome],
+        base: Fit | None,
+        beaten: float,
+        earned: float,
         what: str,
     ) -> dict[str, Outcome]:
         """Ever longer fits of those that may still win."""
@@ -160,7 +172,7 @@ class Race:
             limit = min(earned, worth_having(_best(found), base))
             going = _may_still_win(found, gained, beaten, limit)
             again = self._fitted(
-                [replace(o.task, leads=(o.train,), iterations=iterations) for o in going],
+                [replace(o.task, warm_starts=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
             )
             gained = {n: chi2(found[n]) - chi2(o) for n, o in again.items()}
@@ -189,10 +201,10 @@ class Race:
         found: list[Fit] = []
         # Many lead the same way: the first few may do.
         for tasks in (light[-FIRST_FEW:], light[:-FIRST_FEW]):
-            looks = self.look(tasks, f'first look at {what}')
+            screenings = self.screen(tasks, f'first look at {what}')
             limit = base.first.normalised_error / SAME
-            best = sorted((k for k in looks if _known(k) < limit), key=_known)[:FOLLOWED]
-            arguments = [(base, look.task.leads[0], self.train) for look in best]
+            best = sorted((k for k in screenings if _known(k) < limit), key=_known)[:FOLLOWED]
+            arguments = [(base, screening.task.warm_starts[0], self.train) for screening in best]
             found += filter(None, self.carry_out(deeper, arguments, f'{what}, and without them'))
             if any(fit.normalised_error < SETTLED for fit in found):
                 break
@@ -200,7 +212,9 @@ class Race:
 
     def forget(self, base: Task) -> None:
         """Looks at what stands on top of a base, which set out from its values."""
-        self.looks = {key: look for key, look in self.looks.items() if key[:2] != _of(base)}
+        self.screenings = {
+            key: screening for key, screening in self.screenings.items() if key[:2] != _of(base)
+        }
 
     def _happened(self, base: Task, what: str) -> bool:
         """Whether few pieces of the records are spoilt and all others are as they should be."""
@@ -230,7 +244,7 @@ def _of(base: Task) -> tuple:
 def _causes(base: Task) -> frozenset[str]:
     """Labels of a base's effects, less small faults."""
     labels = frozenset(effect.label for effect in base.model.effects)
-    return labels - imperfect(base.model, base.bounds)
+    return labels - nuisances(base.model, base.bounds)
 
 
 def _on_top(base: Task, effects: Effects) -> list[Task]:
@@ -247,17 +261,17 @@ def _longest_first(tasks: Iterable[Task]) -> list[Task]:
     return sorted(tasks, key=cost_of, reverse=True)
 
 
-def _known(look: Look) -> float:
+def _known(screening: Screening) -> float:
     """Its error; infinite where the first seconds cannot tell."""
-    return look.error if np.isfinite(look.error) else np.inf
+    return screening.error if np.isfinite(screening.error) else np.inf
 
 
 def _error(found: Fit | None) -> float:
     return np.inf if found is None else found.normalised_error
 
 
-def _smallest(looks: Iterable[Look]) -> float:
-    return min(map(_known, looks), default=np.inf)
+def _smallest(screenings: Iterable[Screening]) -> float:
+    return min(map(_known, screenings), default=np.inf)
 
 
 def _best(found: Mapping[str, Outcome]) -> float:
@@ -293,23 +307,23 @@ def _clear(best: float, first: Fit | None) -> float:
     return best if best - 1 < (_error(first) - 1) / MOST else np.inf
 
 
-def _nothing_helps(base: Task, looks: Sequence[Look]) -> bool:
+def _nothing_helps(base: Task, screenings: Sequence[Screening]) -> bool:
     """Whether much is wrong that nothing explains in the first seconds."""
     if base.base is None or base.first is None or base.base.normalised_error < MUCH:
         return False
-    return base.first.normalised_error < MUCH or _smallest(looks) > MUCH
+    return base.first.normalised_error < MUCH or _smallest(screenings) > MUCH
 
 
 def _worth_more(
-    looks: Sequence[Look], reach: float, first: Fit | None, fewest: int
-) -> list[Look]:
+    screenings: Sequence[Screening], reach: float, first: Fit | None, fewest: int
+) -> list[Screening]:
     """Looks within reach of the best, and those that cannot tell."""
-    errors = sorted(filter(np.isfinite, map(_known, looks)))
+    errors = sorted(filter(np.isfinite, map(_known, screenings)))
     if not errors:
-        return list(looks)
+        return list(screenings)
     reach = min(reach, IN_REACH * errors[0], worth_having(_clear(errors[0], first), first))
     limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
-    return [look for look in looks if not look.error > limit]
+    return [screening for screening in screenings if not screening.error > limit]
 
 
 def _may_still_win(

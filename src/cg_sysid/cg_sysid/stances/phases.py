@@ -122,19 +122,21 @@ def _identified(model: Model, phases: Sequence[Record]) -> Model:
     A phase that is one slide from end to end would pull all numbers its way: those that are left
     far behind are let go.
     """
-    better, trials = model, prepare(model, phases) if phases else []
-    for _ in range(TRIMMINGS if trials else 0):
+    better, data_sets = model, prepare(model, phases) if phases else []
+    for _ in range(TRIMMINGS if data_sets else 0):
         try:
-            found = fit(model, trials, iterations=ITERATIONS)
+            found = fit(model, data_sets, iterations=ITERATIONS)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
             return better
         better = found.model
         errors = (found.mse * found.count).sum(axis=1) / found.count.sum(axis=1)
         limit = LEFT_BEHIND * max(1.0, float(np.median(errors)))
-        kept = [trial for trial, error in zip(trials, errors, strict=True) if error < limit]
-        if len(kept) == len(trials):
+        kept = [
+            data_set for data_set, error in zip(data_sets, errors, strict=True) if error < limit
+        ]
+        if len(kept) == len(data_sets):
             break
-        trials = kept
+        data_sets = kept
     return better
 
 

@@ -17,7 +17,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_dynamics.rollout.compiled import compile_model
 from cg_dynamics.walking.impact import other
-from cg_sysid.identification.data_set import as_trial, noise_floor
+from cg_sysid.identification.data_set import as_data_set, noise_floor
 from cg_sysid.records.jumps import on_grid
 from cg_sysid.records.noise import channel_noise
 from cg_sysid.records.record import Record
@@ -259,21 +259,24 @@ class Pieces:
             outputs=outputs,
             setup=replace(self.record.setup, stance=stance),
         )
-        trial = as_trial(self.model.mechanism, piece, self.sigma)
-        compiled = compile_model(self.model, trial.setup)
-        p, u = parameter_vector(self.model, trial.setup), trial.inputs_for(compiled.input_names)
+        data_set = as_data_set(self.model.mechanism, piece, self.sigma)
+        compiled = compile_model(self.model, data_set.setup)
+        p, u = (
+            parameter_vector(self.model, data_set.setup),
+            data_set.inputs_for(compiled.input_names),
+        )
         columns = np.full(len(compiled.free), -1)
-        motion, belief = trial.motion, np.diag(1 / trial.motion_sigma**2)
+        motion, belief = data_set.motion, np.diag(1 / data_set.motion_sigma**2)
         # So short a motion depends on its start almost linearly.
         for _ in range(ITERATIONS):
             x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
             normal, _, _ = compiled.normal(
-                trial.time, u, x0, by_motion, p, columns, trial.outputs, 1 / trial.sigma
+                data_set.time, u, x0, by_motion, p, columns, data_set.outputs, 1 / data_set.sigma
             )
-            if normal.rows < len(trial.time) or not np.isfinite(normal.hessian).all():
+            if normal.rows < len(data_set.time) or not np.isfinite(normal.hessian).all():
                 return np.inf
             error = float(normal.sse.sum() / normal.count.sum())
-            away = trial.motion - motion
+            away = data_set.motion - motion
             motion = motion - np.linalg.solve(
                 normal.hessian + belief, normal.gradient - belief @ away
             )
