@@ -69,17 +69,17 @@ def test_twins_are_level_wherever_their_fits_to_one_half_ended(fitted):
     held = score(one.train.model.with_values(values), data_sets[1:])
     one = replace(one, train=astray, held=held)
     twins = [one, other]
-    assert _apart(selection.comparison(base, twins)) < -10
-    joint = selection.comparison(base, twins, [fit_to_all(o, data_sets) for o in twins])
+    assert _apart(selection.compare(base, twins)) < -10
+    joint = selection.compare(base, twins, [fit_to_all(o, data_sets) for o in twins])
     assert abs(_apart(joint)) < 2
 
 
 def test_without_all_joint_fits_none_counts(fitted):
     selection, base, twins, _ = fitted
     much = replace(twins[0].train, mse=1e-3 * twins[0].train.mse)
-    joint = selection.comparison(base, twins, [much, 'runs away'])
-    assert _apart(joint) == _apart(selection.comparison(base, twins))
-    assert joint.margin <= selection.comparison(base, twins).margin
+    joint = selection.compare(base, twins, [much, 'runs away'])
+    assert _apart(joint) == _apart(selection.compare(base, twins))
+    assert joint.margin <= selection.compare(base, twins).margin
 
 
 def _leaving(o, train, held):

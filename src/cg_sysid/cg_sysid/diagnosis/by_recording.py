@@ -28,6 +28,8 @@ MOST = 30  # recordings; of more, as the steps of a walk, none is a session
 EXPLAINS = 0.7  # share of the error above the noise that a number must take away
 CLEARLY = 0.5  # of what the next best number leaves, that the best may leave
 ITERATIONS = 24
+FIRST_ITERATIONS = 4  # of all numbers, before the best of them go on
+FINALISTS = 3
 
 Run = Callable[[Callable, list[tuple], str], list]
 
@@ -49,15 +51,20 @@ def what_wanders(
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     numbers = list(numbers_of(o.train.model, data_sets, names))
-    base = run(_fit_with_own, [(o, '', None, data_sets, start, np.inf)], 'all recordings as one')[
-        0
-    ]
+    nothing = (o, '', None, data_sets, start, np.inf, ITERATIONS)
+    base = run(_fit_with_own, [nothing], 'all recordings as one')[0]
     if isinstance(base, str) or base.normalised_error < AT_NOISE:
         return None
     # Who leaves more is neither named nor in the way of another.
     reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
-    arguments = [(o, *number, data_sets, start, reach) for number in numbers]
-    found = run(_fit_with_own, arguments, 'recording by recording')
+    arguments = [(o, *number, data_sets, start, reach, FIRST_ITERATIONS) for number in numbers]
+    first = run(_fit_with_own, arguments, 'recording by recording')
+    leading = sorted(
+        ((f, number) for f, number in zip(first, numbers, strict=True) if isinstance(f, Fit)),
+        key=lambda pair: _above_noise(pair[0]),
+    )[:FINALISTS]
+    arguments = [(o, *number, data_sets, f, reach, ITERATIONS) for f, number in leading]
+    found = run(_fit_with_own, arguments, 'the best of them to their end')
     fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
     if not fits:
         return None
@@ -107,7 +114,13 @@ def numbers_of(
 
 
 def _fit_with_own(
-    o: Outcome, name: str, at: str | None, data_sets: Sequence[DataSet], start: Fit, reach: float
+    o: Outcome,
+    name: str,
+    at: str | None,
+    data_sets: Sequence[DataSet],
+    start: Fit,
+    reach: float,
+    iterations: int,
 ) -> Fit | str:
     """A fit to all records where every recording has its own size of the effect that is named."""
     model = with_own(o.model, name, at, o.train.model) if name else o.model
@@ -119,7 +132,7 @@ def _fit_with_own(
             start=started_from(start, model, bounds),
             own=o.events,
             bounds=bounds,
-            iterations=ITERATIONS,
+            iterations=iterations,
             reach=reach,
         )
         return replace(found, model=o.model)  # a class made here does not leave this process

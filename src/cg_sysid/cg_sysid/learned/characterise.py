@@ -205,7 +205,7 @@ def _compare(tasks: Sequence[Task], labels: Sequence[str], sides, run: Run) -> C
     ]
     if not isinstance(reference, Outcome) or not good:
         return None
-    comparison = ModelSelection(*sides).comparison(reference, good)
+    comparison = ModelSelection(*sides).compare(reference, good)
     # Those that may be accepted first.
     ranked = sorted(comparison.ranked, key=lambda pair: bool(pair[0].reason))
     return replace(comparison, ranked=tuple(ranked))

@@ -120,7 +120,7 @@ class ModelSelection:
         block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
-    def comparison(
+    def compare(
         self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | str] = ()
     ) -> Comparison:
         """Rank outcomes that extend a base.

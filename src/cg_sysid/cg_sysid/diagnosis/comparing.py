@@ -1,0 +1,97 @@
+"""Screen, fit, select: the library in competition on top of one base."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.search.candidates import (
+    SAME,
+    Outcome,
+    Task,
+    candidates_for,
+    chi2,
+    first_seconds,
+)
+from cg_sysid.search.model_selection import (
+    Comparison,
+    settled,
+)
+from cg_sysid.search.nuisance import (
+    nuisances,
+)
+from cg_sysid.search.successive_halving import Effects
+
+DEEPER = 3  # times that a base is asked for deeper minima
+
+
+def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Comparison:
+    """The library in competition on top of a base, and with what came to chi2/N `beaten`."""
+    added = work.added(base)
+    key = added, bool(base.task.bounds)
+    if key not in work.comparisons:
+        recorded = {name for data_set in work.train for name in data_set.input_names}
+        bounds = base.task.bounds
+        effects = candidates_for(
+            base.model, work.setups(), work.options.effects, recorded,
+            nuisances(base.model, bounds),
+        )  # fmt: skip
+        title = f'effects on top of {work.title(added)}'
+        work.under_way = base
+        base, task = led_deeper(work, base, effects, title)
+        work.under_way = base
+        outcomes: list[Outcome] = []
+        aside: list[str] = []
+        if not done(work, base):
+            outcomes, aside = work.halving.run(
+                task, effects, title, beaten, work.selection.to_be_earned(base)
+            )
+        comparison = work.selection.compare(base, outcomes)
+        work.comparisons[key] = replace(comparison, aside=tuple(aside))
+    return work.comparisons[key]
+
+
+def led_deeper(
+    work: Workspace, base: Outcome, effects: Effects, title: str
+) -> tuple[Outcome, Task]:
+    """A base, or the deeper minimum of it that effects on top of it showed; and its task."""
+    task_alone = alone(work, base)
+    for _ in range(DEEPER):
+        warm_start = (
+            None if done(work, base) else work.halving.lead_deeper(task_alone, effects, title)
+        )
+        if warm_start is None:
+            break
+        task = replace(task_alone, warm_starts=(warm_start,), base=None)
+        deeper = work.halving.fit([task], f'{work.title(work.added(base))}, deeper')[0]
+        if isinstance(deeper, str) or SAME * chi2(deeper) > chi2(base):
+            break
+        work.halving.forget(task_alone)
+        base = replace(deeper, label=base.label)
+        task_alone = alone(work, base)
+    return base, task_alone
+
+
+def done(work: Workspace, o: Outcome) -> bool:
+    """Whether there is nothing to look for on top of this."""
+    return (settled(o) and not work.selection.imitated(o)) or work.selection.nothing_material(o)
+
+
+def alone(work: Workspace, base: Outcome) -> Task:
+    """The task of a base by itself, with its fits."""
+    task = Task(base.model, None, base.events, base.task.bounds, base=base.train)
+    return replace(task, first=first_seconds(task, work.train))
+
+
+def refitted(work: Workspace, o: Outcome) -> Outcome:
+    """The same structure from the file's numbers again, if that comes out better.
+
+    What stands as the base of a round has to be as good as it can be, or the next effect is
+    accepted for a better fit of this one. At the noise there is no next round.
+    """
+    if settled(o):
+        return o
+    task = Task(o.model, events=o.events, bounds=o.task.bounds)
+    again = work.halving.fit([task], f'{o.label} again')
+    better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
+    return replace(better[0], label=o.label) if better else o

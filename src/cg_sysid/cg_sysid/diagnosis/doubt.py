@@ -1,0 +1,69 @@
+"""Doubt: each accepted effect is taken out again, and the library competes for its place."""
+
+import logging
+from dataclasses import replace
+
+from cg_sysid.diagnosis.comparing import compare
+from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.search.candidates import (
+    Outcome,
+    Task,
+    chi2,
+)
+from cg_sysid.search.model_selection import (
+    Comparison,
+)
+from cg_sysid.search.nuisance import (
+    with_nuisances,
+)
+from cg_sysid.search.ranking import contains
+
+log = logging.getLogger(__name__)
+
+
+def exchange(work: Workspace, nominal: Outcome, final: Outcome) -> Outcome | None:
+    """A better structure: without an effect that is not earned, or with another instead.
+
+    Beside the others an effect may turn out to have stood in for what came later.
+    """
+    for label in sorted(work.added(final)):
+        comparison = without(work, nominal, final, label)
+        if comparison is None:
+            continue
+        own = comparison.of(label)
+        winner = comparison.winner()
+        if winner is None or own is None:
+            return comparison.base
+        rival, outcome = winner
+        better = rival.evidence > own[0].evidence + comparison.margin
+        simpler = contains(label, rival.label)
+        if rival.label != label and (own[0].reason or better or simpler):
+            return outcome
+    return None
+
+
+def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Comparison | None:
+    """The library in competition for the place of one of several effects."""
+    others = work.added(final) - {label}
+    key = others, bool(final.task.bounds)
+    if key not in work.comparisons:
+        model, bounds = final.model.without_effect(label), final.task.bounds
+        if bounds:
+            model, missing = with_nuisances(model, work.setups())
+            bounds = {**bounds, **missing}
+        task = Task(model, events=final.events, bounds=bounds)
+        known = not others and not bounds
+        lean = nominal if known else work.halving.fit([task], f'model without {label}')[0]
+        if isinstance(lean, str):
+            log.info('without %s: %s', label, lean)
+            return None
+        # Who would take the place has to come up to what is there.
+        compare(work, lean, final.train.normalised_error)
+    comparison = work.comparisons[key]
+    # The fit beside the others may have been better, or the only one that went through.
+    ranked = comparison.of(label)
+    if ranked is None or chi2(final) < chi2(ranked[1]):
+        outcomes = [o for _, o in comparison.ranked if o.label != label]
+        again = work.selection.compare(comparison.base, [*outcomes, replace(final, label=label)])
+        comparison = work.comparisons[key] = replace(again, aside=comparison.aside)
+    return comparison

@@ -1,0 +1,198 @@
+"""What every robot has a little of: let go within bounds, taken back where it explains nothing."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+from cg_sysid.diagnosis.comparing import compare, refitted
+from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.search.candidates import (
+    Outcome,
+    Task,
+    chi2,
+    parameters_of,
+    started_from,
+)
+from cg_sysid.search.model_selection import (
+    EARNED,
+    MATERIAL,
+    Comparison,
+    above_noise,
+    at_noise,
+    explained_by,
+    settled,
+)
+from cg_sysid.search.nuisance import (
+    as_sound_robots,
+    faults_among,
+    nuisances,
+    with_nuisances,
+)
+from cg_sysid.search.ranking import Candidate
+from cg_sysid.text import measured
+
+log = logging.getLogger(__name__)
+
+MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
+SHOWS = 3.0  # standard deviations from which a small fault is there at all
+SMALL_FAULTS = 'small faults'
+
+
+def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
+    """The same with what every robot has a little of, if that explains anything."""
+    if settled(o) or o.task.bounds:
+        return o
+    model, bounds = with_nuisances(o.model, work.setups())
+    title = f'{work.title(work.added(o))}, with small faults'
+    found = work.halving.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
+    if isinstance(found, str):
+        log.info('small faults: %s', found)
+        return o
+    if at_noise(o):
+        return found if settled(found) else o  # only beliefs are at stake
+    # Beside a large cause they would explain a little of it; then they can wait.
+    return found if chi2(found) < MOST_OF_IT * chi2(o) else o
+
+
+def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcome | None:
+    """One effect that alone explains more than all small faults together, if there is one.
+
+    Together they can imitate much, but hardly down to the last of it.
+    """
+    if faulty is plain or settled(plain):
+        return None
+    comparison = compare(work, plain, faulty.train.normalised_error)
+    plain, winner = comparison.base, comparison.winner()
+    if winner is None:
+        return plain if settled(plain) else None
+    least = winner[0].evidence - comparison.margin
+    if any(as_sound_robots(c.label, c.parameters)
+           for c, _ in comparison.ranked if c.evidence > least):  # fmt: skip
+        return None  # it may be no more than that
+    both = work.selection.compare(plain, [winner[1], replace(faulty, label=SMALL_FAULTS)])
+    (first, _), (second, _) = both.ranked
+    label = winner[0].label
+    if first.evidence < second.evidence + both.margin:
+        if len(shown(faulty)) < 2:
+            work.instead = instead_of(*winner)
+            return None
+        # One cause that looks like several small faults, or several that conspire.
+        work.doubted[label] = replace(faulty, label=SMALL_FAULTS)
+    elif first.label == SMALL_FAULTS:
+        return None
+    work.note(comparison, label)
+    return refitted(work, winner[1])
+
+
+def of_size(work: Workspace, comparison: Comparison) -> Comparison:
+    """Without winners that hide behind small faults, but are small themselves.
+
+    What a cause explains is asked beside those small faults only that it does not make idle.
+    """
+    while work.selection.imitated(comparison.base) and (winner := comparison.winner()):
+        label = winner[0].label
+        lean = less_small_faults(work, winner[1])
+        without = without_small_faults(work, lean, [label])
+        explained = explained_by(without, lean) if without else 0.0
+        if explained >= MATERIAL:
+            break
+        comparison = comparison.less(
+            label, f'explains {explained:.2f} noise standard deviations where no small fault '
+            f'does, {MATERIAL:g} needed'
+        )  # fmt: skip
+    return comparison
+
+
+def less_small_faults(work: Workspace, final: Outcome) -> Outcome:
+    """Without those small faults that, beside the causes, explain nothing any more."""
+    small = nuisances(final.model, final.task.bounds)
+    idle = [label for label in sorted(small) if not shows(final, label)]
+    for gone in (sorted(small), idle):
+        if not gone:
+            continue
+        lean = without_small_faults(work, final, gone)
+        if lean is None:
+            continue
+        if work.selection.compare(lean, [final]).ranked[0][0].evidence < EARNED:
+            return lean
+    return final
+
+
+def bare(work: Workspace, o: Outcome) -> Outcome | None:
+    """The same without anything small that the nominal model does not state."""
+    large = replace(o, task=replace(o.task, bounds=faults_among(o.model, o.task.bounds)))
+    return without_small_faults(work, large, sorted(nuisances(o.model, o.task.bounds)))
+
+
+def without_small_faults(work: Workspace, o: Outcome, gone: Sequence[str]) -> Outcome | None:
+    """The same without the small faults of these labels; None where that cannot be fitted."""
+    model, bounds = o.model, dict(o.task.bounds)
+    for label in gone:
+        model = model.without_effect(label)
+        bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
+    start = started_from(o.train, model, bounds)
+    task = Task(model, events=o.events, bounds=bounds, warm_starts=(start,))
+    lean = work.halving.fit([task], 'without small faults')[0]
+    return None if isinstance(lean, str) else lean
+
+
+def told_small_faults(work: Workspace, final: Outcome) -> list[str]:
+    """What is there of small faults and what else would explain them, in words."""
+    found = small_faults_of(final)
+    if work.selection.imitated(final):
+        found.append(
+            f'what these leave is {1 + above_noise(final):.3f} times the noise and follows '
+            'something: a small cause may hide behind them'
+        )
+    return [*found, work.instead] if found and work.instead else found
+
+
+def shown(o: Outcome) -> tuple[str, ...]:
+    """Small faults that are there."""
+    small = sorted(nuisances(o.model, o.task.bounds))
+    return tuple(label for label in small if shows(o, label))
+
+
+def shows(o: Outcome, label: str) -> bool:
+    """True if a small fault is larger than its uncertainty."""
+    value, sigma, _ = next(iter(parameters_of(o, label).values()))
+    return abs(value) > SHOWS * sigma
+
+
+def small_faults_of(o: Outcome) -> list[str]:
+    """What is there of small faults, in words."""
+    found = []
+    for label in sorted(nuisances(o.model, o.task.bounds)):
+        for name, (value, sigma, unit) in parameters_of(o, label).items():
+            if abs(value) > SHOWS * sigma:
+                found.append(
+                    f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
+                )
+    return found
+
+
+def shapes(o: Outcome) -> list[str]:
+    """Laws that have another shape than the model states, in words."""
+    found = []
+    for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True):
+        if u.name not in o.task.bounds or not o.model.declarations[u.name].leeway:
+            continue
+        off = abs(u.to_coordinate(v) - u.to_coordinate(u.prior))
+        if off > SHOWS * (s / v if u.logarithmic else s):
+            found.append(
+                f'{u.name} = {measured(v, s, u.unit)} and not {measured(u.prior, None, u.unit)}: '
+                'the shape of a law, which texts and machines draw differently'
+            )
+    return found
+
+
+def instead_of(candidate: Candidate, o: Outcome) -> str:
+    """That one effect explains as much as a small fault, in words."""
+    numbers = ', '.join(
+        f'{name} = {measured(value, sigma, unit)}'
+        for name, (value, sigma, unit) in parameters_of(o, candidate.label).items()
+    )
+    return (
+        f'{candidate.label} ({numbers}) alone would explain as much as this small fault does: '
+        'records in other set-ups would tell'
+    )
