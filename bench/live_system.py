@@ -69,11 +69,11 @@ def lockstep_pace(ticks: int) -> list[tuple[str, str]]:
         with own_domain(), tempfile.TemporaryDirectory() as directory:
             machine = ['-p', 'mode:=lockstep', '-p', 'exit_when_done:=true']
             machine += ['-p', f'duration:={ticks * PERIOD}', '-p', f'recorders:={recorders}']
-            nodes = [start('cg_sysid.experiments.excitation_node', '-p', 'kind:=none')]
+            nodes = [start('cg_sysid.excitation_node', '-p', 'kind:=none')]
             if recorders:
                 bag = Path(directory) / 'bag'
                 recorder = ('-p', f'bag:={bag}', '-p', 'time:=stamp')
-                nodes.append(start('cg_sysid.records.recorder_node', *recorder))
+                nodes.append(start('cg_sysid.recorder_node', *recorder))
             machine_process = start('cg_hardware.simulation_node', *machine)
             _, log = machine_process.communicate()
             for node in nodes:

@@ -101,7 +101,7 @@ def start(bag: Path) -> tuple[subprocess.Popen, Path]:
     log = bag.with_suffix('.log')
     with log.open('w') as output:
         process = subprocess.Popen(
-            [sys.executable, '-m', 'cg_sysid.records.recorder_node', '--ros-args', '-p',
+            [sys.executable, '-m', 'cg_sysid.recorder_node', '--ros-args', '-p',
              f'bag:={bag}'],
             stdout=output, stderr=output,
         )  # fmt: skip

@@ -24,8 +24,8 @@ PROGRAMS = [
     'frequency_response = cg_sysid.identification.frequency_response:main',
 ]
 NODES = [
-    'excitation_node = cg_sysid.experiments.excitation_node:main',
-    'recorder_node = cg_sysid.records.recorder_node:main',
+    'excitation_node = cg_sysid.excitation_node:main',
+    'recorder_node = cg_sysid.recorder_node:main',
 ]
 
 

@@ -134,7 +134,7 @@ def test_help_starts_nothing(name, word, monkeypatch, capsys):
 def test_an_argument_that_no_node_knows_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(rclpy, 'init', None)
     monkeypatch.setattr(os, 'setpriority', None)
-    main = importlib.import_module('cg_sysid.records.recorder_node').main
+    main = importlib.import_module('cg_sysid.recorder_node').main
     assert main(['--bag', 'x', '--ros-args', '-p', 'bag:=y']) == 2
     said = capsys.readouterr().err
     assert "unknown argument '--bag'" in said

@@ -8,7 +8,8 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.diagnosis.diagnose import diagnose, verdict_of
+from cg_sysid.diagnosis.conclude import verdict_of
+from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Cause, Options
 from cg_sysid.diagnosis.summary import summary_of
 from cg_sysid.experiments.rehearsal import rehearse

@@ -8,7 +8,7 @@ from rich.console import Console
 from test_report import with_verdict
 
 from cg_dynamics.effects import LIBRARY
-from cg_sysid.cli import print_next
+from cg_sysid.cli.common import print_next
 from cg_sysid.diagnosis.next_step import CHECKS, next_step
 from cg_sysid.report import render
 from cg_sysid.report.diagnosis_file import VERDICTS

@@ -23,7 +23,7 @@ from cg_sysid.records.recover import needs_recovery, recover  # noqa: E402
 
 pytestmark = pytest.mark.alone
 
-RECORDER = 'cg_sysid.records.recorder_node'
+RECORDER = 'cg_sysid.recorder_node'
 PERIOD = 0.002  # s
 LOSS = 0.02  # s
 TOPICS = {

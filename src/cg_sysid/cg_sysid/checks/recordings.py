@@ -1,6 +1,6 @@
 """Check of a recording before any fit: is it what it claims to be, and what is it good for?
 
-    python3 -m cg_sysid.checks.recordings BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
+    python3 -m cg_sysid check BAG [BAG ...] [--json] [--model FILE] [--note NOTE.yaml]
 
 The checks themselves are in clock.py, check_timing.py and check_jitter.py (stamps),
 check_signals.py and check_steps.py (single signals), check_kinematics.py (IMU against itself),

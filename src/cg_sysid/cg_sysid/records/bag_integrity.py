@@ -127,7 +127,7 @@ def damaged(path: Path, found: Survey) -> RecordingError:
         )
     return RecordingError(
         f'{path}: {found.path.name} is {what}; make a bag of what is intact '
-        f'({count} messages) with: python3 -m cg_sysid.records.recover {path}'
+        f'({count} messages) with: python3 -m cg_sysid recover {path}'
     )
 
 
@@ -150,7 +150,7 @@ def no_bag(path: Path) -> RecordingError:
 def unfinished(path: Path) -> RecordingError:
     """The error of a recording whose end was never written, with the way out."""
     if needs_recovery(path) and _begins_as_mcap(path):
-        way_out = f'python3 -m cg_sysid.records.recover {path}'
+        way_out = f'python3 -m cg_sysid recover {path}'
     elif path.is_dir() and any(path.glob('*.db3*')):
         way_out = f'ros2 bag reindex {path}'
     else:
