@@ -64,20 +64,20 @@ files: '*.csv'
 mechanism: pendulum
 start: '2011-03-04T10:00:00Z'
 time: {column: t_ms, unit: ms}
-rows: [{column: data set, from: 1, below: 5}]
+rows: [{column: trial, from: 1, below: 5}]
 split:
-  by: [data set]
+  by: [trial]
   at: [{column: t_ms, value: 25}]
-  name: 'e_{data set:02d}_{part}'
+  name: 'e_{trial:02d}_{part}'
   drop_first: 1
 channels:
   angle: {column: angle, unit: counts, counts_per_rev: 4096, gain: -1, offset: 0.1}
   torque: {product: [volt, {column: duty, gain: 0.01}], gain: 0.5}
 commands: {torque: {divide: [volt, {constant: 2.0}]}}
 cases:
-- when: {column: data set, equals: 1}
+- when: {column: trial, equals: 1}
   setup: {stance: inner}
-- when: {column: data set, from: 2}
+- when: {column: trial, from: 2}
   note: {experiment: second}
 note: {experiment: first, initial_state: unknown, sensor_zeros: {angle: 0.0}, closed_loop: false}
 nominal_rate_hz: 200.0
