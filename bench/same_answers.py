@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-sys.path += [str(ROOT / 'src' / p / 'test') for p in ('cg_dynamics', 'cg_sysid')]
+sys.path[:0] = [str(ROOT / 'src' / p / 'test') for p in ('cg_dynamics', 'cg_sysid')]
 SIX = ('payload', 'stribeck_friction', 'actuator_delay', 'torque_constant', 'gyro_bias',
        'joint_flexibility')  # fmt: skip
 EFFECTS = {
@@ -69,10 +69,8 @@ def record(folder: Path, data: Path | None) -> None:
 
 
 def _write(folder: Path, records) -> None:
-    try:
-        from cg_sysid.records.bag_writer import write_bag
-    except ImportError:
-        from cg_sysid.records.bag_writer import write_bag
+    from cg_sysid.records.bag_writer import write_bag
+
     for r in records:
         write_bag(folder / r.name, r)
 
