@@ -26,7 +26,7 @@ from cg_sysid.diagnosis.diagnose import led_in, split
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.parallel import run_all
-from cg_sysid.search.candidates import THOROUGH_ITERATIONS
+from cg_sysid.search import settings
 from cg_sysid.search.nuisance import with_nuisances
 
 SIZES = 1.0, 0.5
@@ -47,7 +47,13 @@ def z_scores(name, seed, faults):
     bounds = {}
     if faults:
         structure, bounds = with_nuisances(structure, [t.setup for t in (*train, *held)])
-    found = fit(structure, train, bounds=bounds, thorough=True, iterations=THOROUGH_ITERATIONS)
+    found = fit(
+        structure,
+        train,
+        bounds=bounds,
+        thorough=True,
+        iterations=settings.FITTING.thorough_iterations,
+    )
     numbers = {
         u.name: (value, sigma, u.unit)
         for u, value, sigma in zip(found.unknowns, found.values, found.sigmas, strict=True)

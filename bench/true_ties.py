@@ -26,7 +26,8 @@ from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import led_in, split
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.parallel import run_all
-from cg_sysid.search.candidates import THOROUGH_ITERATIONS, Task, chi2, try_candidate
+from cg_sysid.search import settings
+from cg_sysid.search.candidates import Task, chi2, try_candidate
 from cg_sysid.search.nuisance import with_nuisances
 
 parser = argparse.ArgumentParser(
@@ -71,7 +72,9 @@ def with_effects(model, names):
 
 def least(tasks, train, held, workers):
     """Cost of the best of these structures: chi2, and distance from what is believed."""
-    thorough = [replace(t, thorough=True, iterations=THOROUGH_ITERATIONS) for t in tasks]
+    thorough = [
+        replace(t, thorough=True, iterations=settings.FITTING.thorough_iterations) for t in tasks
+    ]
     found = run_all(try_candidate, [(t, train, held) for t in thorough], workers)
     return min(chi2(o) + o.train.belief for o in found if not isinstance(o, str))
 

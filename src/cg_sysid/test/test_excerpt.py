@@ -10,7 +10,7 @@ from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.search import excerpt as excerpt
+from cg_sysid.search import excerpt, settings
 from cg_sysid.search.candidates import Task, first_seconds, screen, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
@@ -47,7 +47,7 @@ def test_of_long_records_all_begin(nominal):
 def test_of_many_short_records_some_of_every_set_up(nominal):
     data_sets = _windows(nominal, _records(nominal, 20.0, (SPRINGS, SPRINGS, SOFTER)))
     few = excerpt.few(data_sets)
-    assert excerpt.FEWEST <= len(few) <= len(data_sets) / 2
+    assert settings.SCREENING.fewest_records <= len(few) <= len(data_sets) / 2
     assert {repr(data_sets[i].setup) for i in few} == {
         repr(data_set.setup) for data_set in data_sets
     }

@@ -10,7 +10,7 @@ from cg_sysid.experiments.catalogue import experiments_for, load_experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.search.ranking import MARGIN
+from cg_sysid.search import settings
 
 EFFECTS = ('ankle_friction', 'spring_damping', 'aerodynamic_drag', 'torque_bias')
 
@@ -38,7 +38,7 @@ def test_the_proposed_experiment_settles_what_is_ambiguous(model_file):
     (cause,) = first.causes
     assert {cause.label, *cause.rivals} == {'ankle_friction', 'spring_damping'}
     best = cause.proposals[0]
-    assert best.evidence > MARGIN
+    assert best.evidence > settings.SELECTION.margin
     assert best.experiment != 'spring_stabilised_inner'
     assert best.experiment in first.summary
     records += [
@@ -69,7 +69,7 @@ def test_causes_that_are_one_get_no_advice(model_file):
     (cause,) = found.causes
     assert {cause.label, *cause.rivals} == {'actuator_delay', 'sensor_delay'}
     # Both are fitted to the same noise: what is left is how deep the fits went.
-    assert all(abs(p.evidence) < 0.1 * MARGIN for p in cause.proposals)
+    assert all(abs(p.evidence) < 0.1 * settings.SELECTION.margin for p in cause.proposals)
     assert 'No experiment that can be launched would tell' in found.summary
 
 

@@ -13,9 +13,9 @@ from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, one_minimum, screen
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
-from cg_sysid.search.ranking import MARGIN
 
 EFFECTS = (
     'torque_bias', 'encoder_offset', 'actuator_delay', 'actuator_lag', 'quadratic_friction',
@@ -136,7 +136,7 @@ def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
     assert [(c.label, set(c.rivals)) for c in found.causes] == [('tether_force', rivals)]
     # Nor would the same springs in another pose: recorded, legs_tied leaves the two as they are.
     assert found.causes[0].proposals[0].experiment == 'legs_tied'
-    assert found.causes[0].proposals[0].evidence < MARGIN
+    assert found.causes[0].proposals[0].evidence < settings.SELECTION.margin
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit, predict, score
-from cg_sysid.search.candidates import THOROUGH_ITERATIONS, Task, own_parameters, try_candidate
+from cg_sysid.search import settings
+from cg_sysid.search.candidates import Task, own_parameters, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 
@@ -148,7 +149,7 @@ def test_a_curved_valley_is_followed_to_its_end(model_file, start):
     at = {'stiffness': start, 'rotor_inertia': 0.1, 'damping': 0.3}
     found = fit(
         nominal.with_effect('joint_flexibility'), data_sets, thorough=True,
-        iterations=THOROUGH_ITERATIONS,
+        iterations=settings.FITTING.thorough_iterations,
         at={f'joint_flexibility.{name}': value for name, value in at.items()},
     )  # fmt: skip
     # Noise alone gives 1, within a percent or two at twelve thousand rows.

@@ -11,6 +11,7 @@ from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Task,
     events_of,
@@ -20,7 +21,7 @@ from cg_sysid.search.candidates import (
 )
 from cg_sysid.search.events import undisturbed
 from cg_sysid.search.nuisance import with_nuisances
-from cg_sysid.search.successive_halving import IDLE, SuccessiveHalving, worth_having
+from cg_sysid.search.successive_halving import SuccessiveHalving, worth_having
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values
@@ -194,5 +195,5 @@ def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):
     base = fit(nominal, _data_sets(nominal, _machine(nominal), 2.0))
     leaving = replace(base, mse=np.full_like(base.mse, 1.06))
     assert worth_having(1.06, leaving) == worth_having(np.inf, leaving) == pytest.approx(1.06)
-    assert worth_having(1.01, leaving) == pytest.approx(1.06 - 0.05 * IDLE)
+    assert worth_having(1.01, leaving) == pytest.approx(1.06 - 0.05 * settings.HALVING.idle)
     assert worth_having(1.01, None) == np.inf

@@ -19,8 +19,8 @@ from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, candidates_for, started_from
-from cg_sysid.search.model_selection import AT_NOISE
 from cg_sysid.search.nuisance import turning
 
 FEWEST = 3  # recordings: two always differ
@@ -53,7 +53,7 @@ def what_wanders(
     numbers = list(numbers_of(o.train.model, data_sets, names))
     nothing = (o, '', None, data_sets, start, np.inf, ITERATIONS)
     base = run(_fit_with_own, [nothing], 'all recordings as one')[0]
-    if isinstance(base, str) or base.normalised_error < AT_NOISE:
+    if isinstance(base, str) or base.normalised_error < settings.NOISE.at_noise:
         return None
     # Who leaves more is neither named nor in the way of another.
     reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)

@@ -13,9 +13,8 @@ from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.thorough import fitted_to_all, tie
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.identification.identify import Fit
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
-    SURE,
-    TOO_SMALL,
     Outcome,
     events_in,
     events_of,
@@ -31,8 +30,6 @@ from cg_sysid.search.nuisance import (
 from cg_sysid.search.ranking import contains, effect_name
 
 log = logging.getLogger(__name__)
-
-PROPOSED = 3  # experiments named for each cause with rivals
 
 
 def named_causes(work: Workspace, nominal: Outcome, final: Outcome) -> list[Cause]:
@@ -70,7 +67,7 @@ def proposals(
         lambda done, total: work.progress(
             'rehearsing experiments to tell causes apart', done, total, work.best(None)
         ),
-    )[:PROPOSED]  # fmt: skip
+    )[:settings.DOUBT.proposed]  # fmt: skip
 
 
 def with_events(work: Workspace, final: Outcome, cause: Cause) -> Cause:
@@ -130,8 +127,8 @@ def _idle(o: Outcome, label: str, other: str) -> bool:
     if name != first.name or first.neutral is None or stated is None:
         return False
     return (
-        abs(value - first.neutral) <= TOO_SMALL * sigma
-        and abs(stated.value - first.neutral) > SURE * sigma
+        abs(value - first.neutral) <= settings.SELECTION.too_small * sigma
+        and abs(stated.value - first.neutral) > settings.EVENTS.sure * sigma
     )
 
 

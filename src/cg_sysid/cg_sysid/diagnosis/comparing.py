@@ -5,14 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import (
-    SAME,
-    Outcome,
-    Task,
-    candidates_for,
-    chi2,
-    first_seconds,
-)
+from cg_sysid.search import settings
+from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
 from cg_sysid.search.model_selection import (
     Comparison,
     settled,
@@ -21,8 +15,6 @@ from cg_sysid.search.nuisance import (
     nuisances,
 )
 from cg_sysid.search.successive_halving import Effects
-
-DEEPER = 3  # times that a base is asked for deeper minima
 
 
 def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Comparison:
@@ -56,7 +48,7 @@ def led_deeper(
 ) -> tuple[Outcome, Task]:
     """A base, or the deeper minimum of it that effects on top of it showed; and its task."""
     task_alone = alone(work, base)
-    for _ in range(DEEPER):
+    for _ in range(settings.DOUBT.deeper):
         warm_start = (
             None if done(work, base) else work.halving.lead_deeper(task_alone, effects, title)
         )
@@ -64,7 +56,7 @@ def led_deeper(
             break
         task = replace(task_alone, warm_starts=(warm_start,), base=None)
         deeper = work.halving.fit([task], f'{work.title(work.added(base))}, deeper')[0]
-        if isinstance(deeper, str) or SAME * chi2(deeper) > chi2(base):
+        if isinstance(deeper, str) or settings.SCREENING.same * chi2(deeper) > chi2(base):
             break
         work.halving.forget(task_alone)
         base = replace(deeper, label=base.label)

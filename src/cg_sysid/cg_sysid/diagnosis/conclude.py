@@ -14,7 +14,7 @@ from cg_sysid.diagnosis.by_recording import what_wanders
 from cg_sysid.diagnosis.causes import as_in, named_causes, with_events
 from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.late_samples import late_samples
-from cg_sysid.diagnosis.result import Cause, Diagnosis, gains_of
+from cg_sysid.diagnosis.result import Cause, Diagnosis, Verdict, gains_of
 from cg_sysid.diagnosis.small_faults import shapes, told_small_faults
 from cg_sysid.diagnosis.summary import summary_of
 from cg_sysid.diagnosis.thorough import thorough
@@ -22,8 +22,9 @@ from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.measured_start import MeasuredStart, judged
 from cg_sysid.identification.unknowns import IdentificationError
-from cg_sysid.learned.characterise import NEARLY_ALL, characterise, what_remains
+from cg_sysid.learned.characterise import characterise, what_remains
 from cg_sysid.learned.unmodelled import Unmodelled
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
     Task,
@@ -31,18 +32,10 @@ from cg_sysid.search.candidates import (
     prior_conflicts,
     started_from,
 )
-from cg_sysid.search.model_selection import (
-    ACCOUNTS,
-    above_noise,
-    at_noise,
-    share_explained,
-)
+from cg_sysid.search.model_selection import above_noise, at_noise, share_explained
 from cg_sysid.search.standings import Unfinished
 
 log = logging.getLogger(__name__)
-
-OUTSTANDING = 0.2  # share of the squared error in one record that is worth a word
-OUTSTANDING_TIMES = 4  # and as many times its even share
 
 
 def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
@@ -68,7 +61,9 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     share = share_explained(nominal.held, final.held)
     verdict = verdict_of(causes, bool(left), share)
     late = (
-        told_late_samples(work, gained(work, nominal, final)) if verdict == 'unexplained' else ''
+        told_late_samples(work, gained(work, nominal, final))
+        if verdict is Verdict.UNEXPLAINED
+        else ''
     )
     return answer(work, nominal, final, causes, verdict, unmodelled, wandering, late)
 
@@ -99,7 +94,7 @@ def relative(work: Workspace, nominal: Outcome, term: Unmodelled | None) -> Outc
         return None
     comparison = work.selection.compare(nominal, [min(outcomes, key=chi2)])
     winner = comparison.winner()
-    if winner is None or share_explained(nominal.held, winner[1].held) < NEARLY_ALL:
+    if winner is None or share_explained(nominal.held, winner[1].held) < settings.DOUBT.nearly_all:
         return None
     work.comparisons[frozenset(), bool(nominal.task.bounds)] = comparison
     work.note(comparison, winner[0].label)
@@ -169,7 +164,7 @@ def answer(
     nominal: Outcome,
     final: Outcome,
     causes: Sequence[Cause],
-    verdict: str,
+    verdict: Verdict,
     unmodelled: Unmodelled | None = None,
     wandering: Wandering | None = None,
     late: str = '',
@@ -219,7 +214,7 @@ def _outstanding(o: Outcome) -> list[str]:
         for mse, count in zip(fit.mse, fit.count, strict=True)
     ])  # fmt: skip
     shares = squared / squared.sum()
-    much = max(OUTSTANDING, OUTSTANDING_TIMES / len(names))
+    much = max(settings.DOUBT.outstanding, settings.DOUBT.outstanding_times / len(names))
     return [
         f'{name} holds {share:.0%} of the error that remains in {len(names)} records: look at '
         'what is different there before you believe what was found'
@@ -228,7 +223,7 @@ def _outstanding(o: Outcome) -> list[str]:
     ]
 
 
-def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> str:
+def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> Verdict:
     """The verdict on records.
 
     Args:
@@ -237,7 +232,8 @@ def verdict_of(causes: Sequence[Cause], left: bool, share: float) -> str:
         share: Share of the squared error above the noise that they take.
     """
     if not causes:
-        return 'unexplained' if left else 'consistent'
-    if left and share < ACCOUNTS:
-        return 'unexplained'
-    return 'ambiguous' if any(cause.rivals for cause in causes) else 'explained'
+        return Verdict.UNEXPLAINED if left else Verdict.CONSISTENT
+    if left and share < settings.SELECTION.accounts:
+        return Verdict.UNEXPLAINED
+    rivals = any(cause.rivals for cause in causes)
+    return Verdict.AMBIGUOUS if rivals else Verdict.EXPLAINED

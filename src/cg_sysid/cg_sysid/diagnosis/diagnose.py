@@ -32,6 +32,7 @@ from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Task,
 )
@@ -41,7 +42,6 @@ from cg_sysid.stances.phases import Landing, cut_steps
 
 LEAD_IN_S = 0.1  # of each record, not judged
 LEAD_IN_SHARE = 0.05  # of a short record
-REVIEWS = 4  # passes of doubt over what was accepted
 
 
 def split(
@@ -210,7 +210,7 @@ def search(work: Workspace) -> Diagnosis:
     try:
         final = extend(work, base)
         seen = {work.added(final)}
-        for _ in range(REVIEWS):
+        for _ in range(settings.DOUBT.reviews):
             better = exchange(work, base, final)
             if better is None:
                 break

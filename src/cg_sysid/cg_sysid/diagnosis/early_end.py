@@ -4,7 +4,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.causes import cause_among
 from cg_sysid.diagnosis.comparing import done
 from cg_sysid.diagnosis.conclude import answer, verdict_of
-from cg_sysid.diagnosis.result import Diagnosis
+from cg_sysid.diagnosis.result import Diagnosis, Verdict
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search.candidates import (
     Outcome,
@@ -32,7 +32,8 @@ def answer_so_far(work: Workspace, nominal: Outcome) -> Diagnosis:
     causes = [cause_among(final, label, comparisons) for label in sorted(work.added(final))]
     left = bool(work.left(final))
     verdict = verdict_of(causes, left, share_explained(nominal.held, final.held))
-    verdict = 'unfinished' if verdict == 'unexplained' else verdict
+    if verdict is Verdict.UNEXPLAINED:
+        verdict = Verdict.UNFINISHED
     return answer(work,
         nominal, final, sorted(causes, key=lambda cause: -cause.evidence), verdict,
         unfinished=unfinished(work, final, left),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.result import Cause, Diagnosis
+from cg_sysid.diagnosis.result import Cause, Diagnosis, Verdict
 from cg_sysid.diagnosis.summary import described
 from cg_sysid.identification.gain import Gain
 from cg_sysid.landings.result import Landings
@@ -40,7 +40,8 @@ def with_landings(
     causes = (*answer.causes, *_causes(found))
     verdict = answer.verdict
     if found.accepted:
-        verdict = 'ambiguous' if any(cause.rivals for cause in causes) else 'explained'
+        rivals = any(cause.rivals for cause in causes)
+        verdict = Verdict.AMBIGUOUS if rivals else Verdict.EXPLAINED
     extended = answer.extended
     model = _with_law(extended.train.model, found)
     return replace(

@@ -7,8 +7,7 @@ report say the same.
 from collections.abc import Mapping
 from typing import Any
 
-from cg_sysid.search.candidates import PRIOR_CONFLICT
-from cg_sysid.search.ranking import MARGIN
+from cg_sysid.search import settings
 from cg_sysid.text import effect_name, listed, number
 
 # Where an effect acts -> what a person can look at there, with the machine switched off.
@@ -41,9 +40,11 @@ def next_step(facts: Mapping[str, Any]) -> str:
 
 def _consistent(facts: Mapping[str, Any]) -> str:
     away = [
-        p['name'] for p in facts['parameters']
-        if p['moved_tolerances'] is not None and abs(p['moved_tolerances']) > PRIOR_CONFLICT
-    ]  # fmt: skip
+        p['name']
+        for p in facts['parameters']
+        if p['moved_tolerances'] is not None
+        and abs(p['moved_tolerances']) > settings.PRIOR.conflict
+    ]
     if away:
         return (
             f'Measure {listed(away)} on the machine, or correct the tolerance in the model file: '
@@ -70,7 +71,7 @@ def _ambiguous(facts: Mapping[str, Any]) -> str:
                    if cause['next_experiments']]  # fmt: skip
     # Of a proposal without a number nobody knows what it is worth.
     best = max(experiments, key=lambda e: e['expected_nats'] or 0.0, default=None)
-    if best is not None and (best['expected_nats'] or 0.0) > MARGIN:
+    if best is not None and (best['expected_nats'] or 0.0) > settings.SELECTION.margin:
         torque = best['excitation']
         fastest = f' up to {number(torque["f_max"])} Hz' if 'f_max' in torque else ''
         return (

@@ -6,6 +6,7 @@ summary.py, how it is written to disk in report/diagnosis_file.py.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,19 @@ from cg_sysid.search.ranking import Candidate, Round, per_output
 from cg_sysid.search.standings import Unfinished
 
 MOST_ROUNDS = 4
+
+
+class Verdict(str, Enum):
+    """What a diagnosis says of records: docs/diagnosis.md, section 6."""
+
+    CONSISTENT = 'consistent'
+    EXPLAINED = 'explained'
+    AMBIGUOUS = 'ambiguous'
+    UNEXPLAINED = 'unexplained'
+    UNUSABLE = 'unusable'
+    UNFINISHED = 'unfinished'
+
+    __str__ = str.__str__
 
 
 @dataclass(frozen=True)
@@ -60,8 +74,8 @@ class Diagnosis:
     """The answer.
 
     Attributes:
-        verdict: consistent, explained, ambiguous, unexplained, unusable, or unfinished where the
-            search was broken off before it found what explains most of the error.
+        verdict: Unfinished where the search was broken off before it found what explains most of
+            the error.
         summary: One sentence for people.
         causes: Named causes, strongest first; those of `unexplained` leave most of the error.
         gains: Simulation error before and after on held-out records.
@@ -85,7 +99,7 @@ class Diagnosis:
             cause is named, or their starts carry nowhere.
     """
 
-    verdict: str
+    verdict: Verdict
     summary: str
     causes: tuple[Cause, ...]
     gains: tuple[Gain, ...]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from cg_sysid.diagnosis.comparing import compare, refitted
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
     Task,
@@ -14,8 +15,6 @@ from cg_sysid.search.candidates import (
     started_from,
 )
 from cg_sysid.search.model_selection import (
-    EARNED,
-    MATERIAL,
     Comparison,
     above_noise,
     at_noise,
@@ -33,8 +32,6 @@ from cg_sysid.text import measured
 
 log = logging.getLogger(__name__)
 
-MOST_OF_IT = 0.7  # share of the error that may be left for small faults to be taken up
-SHOWS = 3.0  # standard deviations from which a small fault is there at all
 SMALL_FAULTS = 'small faults'
 
 
@@ -51,7 +48,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     if at_noise(o):
         return found if settled(found) else o  # only beliefs are at stake
     # Beside a large cause they would explain a little of it; then they can wait.
-    return found if chi2(found) < MOST_OF_IT * chi2(o) else o
+    return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
 
 
 def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcome | None:
@@ -94,11 +91,11 @@ def of_size(work: Workspace, comparison: Comparison) -> Comparison:
         lean = less_small_faults(work, winner[1])
         without = without_small_faults(work, lean, [label])
         explained = explained_by(without, lean) if without else 0.0
-        if explained >= MATERIAL:
+        if explained >= settings.SELECTION.material:
             break
         comparison = comparison.less(
             label, f'explains {explained:.2f} noise standard deviations where no small fault '
-            f'does, {MATERIAL:g} needed'
+            f'does, {settings.SELECTION.material:g} needed'
         )  # fmt: skip
     return comparison
 
@@ -113,7 +110,7 @@ def less_small_faults(work: Workspace, final: Outcome) -> Outcome:
         lean = without_small_faults(work, final, gone)
         if lean is None:
             continue
-        if work.selection.compare(lean, [final]).ranked[0][0].evidence < EARNED:
+        if work.selection.compare(lean, [final]).ranked[0][0].evidence < settings.SELECTION.earned:
             return lean
     return final
 
@@ -156,7 +153,7 @@ def shown(o: Outcome) -> tuple[str, ...]:
 def shows(o: Outcome, label: str) -> bool:
     """True if a small fault is larger than its uncertainty."""
     value, sigma, _ = next(iter(parameters_of(o, label).values()))
-    return abs(value) > SHOWS * sigma
+    return abs(value) > settings.DOUBT.shows * sigma
 
 
 def small_faults_of(o: Outcome) -> list[str]:
@@ -164,7 +161,7 @@ def small_faults_of(o: Outcome) -> list[str]:
     found = []
     for label in sorted(nuisances(o.model, o.task.bounds)):
         for name, (value, sigma, unit) in parameters_of(o, label).items():
-            if abs(value) > SHOWS * sigma:
+            if abs(value) > settings.DOUBT.shows * sigma:
                 found.append(
                     f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
                 )
@@ -178,7 +175,7 @@ def shapes(o: Outcome) -> list[str]:
         if u.name not in o.task.bounds or not o.model.declarations[u.name].leeway:
             continue
         off = abs(u.to_coordinate(v) - u.to_coordinate(u.prior))
-        if off > SHOWS * (s / v if u.logarithmic else s):
+        if off > settings.DOUBT.shows * (s / v if u.logarithmic else s):
             found.append(
                 f'{u.name} = {measured(v, s, u.unit)} and not {measured(u.prior, None, u.unit)}: '
                 'the shape of a law, which texts and machines draw differently'

@@ -6,10 +6,11 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.between_recordings import Wandering
-from cg_sysid.diagnosis.result import Cause
+from cg_sysid.diagnosis.result import Cause, Verdict
 from cg_sysid.identification.gain import NO_GAIN, Gain
 from cg_sysid.learned.unmodelled import NOTHING, Unmodelled
-from cg_sysid.search.ranking import MARGIN, effect_name
+from cg_sysid.search import settings
+from cg_sysid.search.ranking import effect_name
 from cg_sysid.text import listed, measured, number
 
 INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
@@ -18,7 +19,7 @@ CERTAIN = 30.0  # nats: odds of 1e13 to 1, beyond what a noise floor a little of
 
 
 def summary_of(
-    verdict: str,
+    verdict: Verdict,
     causes: Sequence[Cause],
     gains: Sequence[Gain],
     left: dict[str, float],
@@ -43,7 +44,7 @@ def summary_of(
         explained: Share of the squared error above the noise that the causes take.
         late: What errors of timing make of an error that stays unexplained, as a sentence.
     """
-    if verdict == 'consistent':
+    if verdict is Verdict.CONSISTENT:
         text = 'The model explains the records down to the noise of the sensors'
         if max(g.before / g.after for g in gains) > NO_GAIN:
             text += (
@@ -54,7 +55,7 @@ def summary_of(
             text += f', but with {", ".join(prior_conflicts)} far from what its file believes'
         return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
-    if verdict == 'unexplained':
+    if verdict is Verdict.UNEXPLAINED:
         known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
         whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
         text = (
@@ -70,7 +71,7 @@ def summary_of(
             )
         return f'{text} {late}' if late else text
     named = ', '.join(described(c) for c in causes)
-    if verdict == 'unfinished':
+    if verdict is Verdict.UNFINISHED:
         text = (
             f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
             f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '
@@ -95,7 +96,7 @@ def summary_of(
             'not be what it is named after.'
         )
     best = next((c.proposals[0] for c in causes if c.proposals), None)
-    if best is not None and best.evidence > MARGIN:
+    if best is not None and best.evidence > settings.SELECTION.margin:
         text += (
             f' To tell {" from ".join(best.weakest)}, run {best.experiment} '
             f'(about {best.evidence:.0f} nats expected).'

@@ -6,25 +6,10 @@ from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.workspace import Workspace, structure
 from cg_sysid.identification.identify import Fit
-from cg_sysid.search.candidates import (
-    SAME,
-    THOROUGH_ITERATIONS,
-    Outcome,
-    Task,
-    chi2,
-    fit_to_all,
-    one_minimum,
-)
-from cg_sysid.search.model_selection import (
-    COARSE_FIDELITY,
-    Comparison,
-    at_noise,
-)
+from cg_sysid.search import settings
+from cg_sysid.search.candidates import Outcome, Task, chi2, fit_to_all, one_minimum
+from cg_sysid.search.model_selection import Comparison, at_noise
 from cg_sysid.search.ranking import contains
-from cg_sysid.search.successive_halving import RUNGS
-
-LEVEL = 1.0  # squared standard deviations within which two fits say the same of all data
-FROM_AFAR = 2.0  # times the best start's error, from which a start leads nowhere else at the noise
 
 
 def thorough(work: Workspace, o: Outcome) -> Outcome:
@@ -41,7 +26,7 @@ def thorough(work: Workspace, o: Outcome) -> Outcome:
 def fitted_thoroughly(work: Workspace, o: Outcome) -> Outcome:
     """From where it stands, and from other minima of the same structure."""
     task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
-                iterations=THOROUGH_ITERATIONS)  # fmt: skip
+                iterations=settings.FITTING.thorough_iterations)  # fmt: skip
     tasks = [replace(task, warm_starts=(start.train,)) for start in (o, *other_minima(work, o))]
     title = f'thorough fits of {work.title(work.added(o))}'
     found = [fitted for fitted in work.halving.fit(tasks, title) if isinstance(fitted, Outcome)]
@@ -59,12 +44,17 @@ def other_minima(work: Workspace, o: Outcome) -> list[Outcome]:
         for e in effects
     ]
     title = f'other starts of {work.title(work.added(o))}'
-    near = SAME * o.train.normalised_error
+    near = settings.SCREENING.same * o.train.normalised_error
     tasks = [
-        replace(screening.task, warm_starts=(warm_start,), iterations=RUNGS[0], reach=near)
+        replace(
+            screening.task,
+            warm_starts=(warm_start,),
+            iterations=settings.HALVING.rungs[0],
+            reach=near,
+        )
         for screening in work.halving.screen_beside(without, title)
         for warm_start in screening.task.warm_starts
-        if warm_start.normalised_error < FROM_AFAR * screening.error
+        if warm_start.normalised_error < settings.DOUBT.from_afar * screening.error
     ]
     found = work.halving.fit(tasks, title)
     return [
@@ -80,7 +70,7 @@ def tie(work: Workspace, comparison: Comparison, label: str) -> Comparison | Non
 
     One that has the effect within it fits as well by itself, and is no rival.
     """
-    rivals = (c.label for c in comparison.close_to(label, COARSE_FIDELITY))
+    rivals = (c.label for c in comparison.close_to(label, settings.SELECTION.coarse_fidelity))
     close = [label, *(rival for rival in rivals if not contains(rival, label))]
     ties = [pair[1] for name in close if (pair := comparison.of(name)) and at_noise(pair[1])]
     if len(ties) < 2 or ties[0].label != label:
@@ -130,5 +120,5 @@ def _further_up(other: Fit, found: Fit) -> bool:
 
     Fitted to its end it would come down along the valley to the other, slowly.
     """
-    level = abs(other.squares - found.squares) < LEVEL
+    level = abs(other.squares - found.squares) < settings.DOUBT.level
     return level and other.belief >= found.belief

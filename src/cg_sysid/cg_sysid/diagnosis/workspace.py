@@ -12,14 +12,11 @@ from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.kept_fits import keeping
 from cg_sysid.parallel import run_all
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
 )
-from cg_sysid.search.model_selection import (
-    MATERIAL,
-    Comparison,
-    ModelSelection,
-)
+from cg_sysid.search.model_selection import Comparison, ModelSelection
 from cg_sysid.search.nuisance import (
     nuisances,
 )
@@ -129,7 +126,11 @@ class Workspace:
 
     def left(self, o: Outcome) -> dict[str, float]:
         """Those of them that are above the noise."""
-        return {c: v for c, v in self.remaining(o).items() if v > (1 + MATERIAL) ** 2}
+        return {
+            c: v
+            for c, v in self.remaining(o).items()
+            if v > (1 + settings.SELECTION.material) ** 2
+        }
 
 
 def structure(o: Outcome) -> Structure:

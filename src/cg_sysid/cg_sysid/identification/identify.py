@@ -24,7 +24,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
 from cg_sysid.identification import kept_fits
-from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
     BARRIER,
@@ -43,6 +43,7 @@ from cg_sysid.identification.unknowns import (
     unknowns_of,
     unsettled_states,
 )
+from cg_sysid.records.record import Record
 from cg_sysid.text import off_by
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
@@ -630,6 +631,20 @@ def in_data_set(model: Model, own: np.ndarray) -> tuple[Model, np.ndarray]:
     acting = {f'{e.label}.{s}' for e in acting_effects(model) for s in e.states}
     taken = [True] * (len(start) - len(states)) + [name in acting for name in states]
     return model, start[np.array(taken, bool)]
+
+
+def identify(model: Model, records: Sequence[Record], **how: Any) -> Fit:
+    """Identify a model's parameters from recordings.
+
+    Args:
+        model: What is believed: values, tolerances, bounds.
+        records: Recordings of its machine.
+        how: Options of `fit`.
+
+    Raises:
+        IdentificationError: if the records cannot be used with this model.
+    """
+    return fit(model, prepare(model, records), **how)
 
 
 def predict(

@@ -22,8 +22,7 @@ from cg_sysid.landings.contact_fit import FREE, SMALLEST, ContactFit, ContactTas
 from cg_sysid.landings.impulse import measure_impulse
 from cg_sysid.landings.landings import Passage, ready
 from cg_sysid.landings.result import Impulse, Landings, LawTried
-from cg_sysid.search.model_selection import AT_NOISE, EARNED, FIDELITY, MATERIAL, SIGNIFICANT
-from cg_sysid.search.ranking import MARGIN
+from cg_sysid.search import settings
 from cg_sysid.stances.phases import Landing
 
 MOST = 12  # landings that are fitted, and as many that judge
@@ -76,7 +75,11 @@ def judge_landings(
         fits = _fits(run, task, [(name,) for name in names])
         best = min((f for f in fits), key=lambda f: f.chi2, default=None)
         # A little that is left is the ground's own softness, or the model's numbers.
-        if best is not None and len(names) > 1 and _error(best.residuals) > (1 + MATERIAL) ** 2:
+        if (
+            best is not None
+            and len(names) > 1
+            and _error(best.residuals) > (1 + settings.SELECTION.material) ** 2
+        ):
             fits += _fits(run, task, [tuple(names)])
     return _verdict(task, base, fits, len(landings), believed)
 
@@ -129,11 +132,13 @@ def _verdict(
         (_judged(base, fit, first, weight(base) - weight(fit), rows) for fit in fits),
         key=lambda t: -t.evidence,
     )
-    margin = max(MARGIN, FIDELITY * independent / 2)
+    margin = max(settings.SELECTION.margin, settings.SELECTION.fidelity * independent / 2)
     single = [t for t in tried if len(t.effects) == 1 and not t.reason]
     both = [t for t in tried if len(t.effects) > 1 and not t.reason]
     accepted = single[0] if single else None
-    if both and (accepted is None or both[0].evidence > accepted.evidence + EARNED):
+    if both and (
+        accepted is None or both[0].evidence > accepted.evidence + settings.SELECTION.earned
+    ):
         accepted = both[0]
     close = [
         t.effects[0] for t in single
@@ -143,7 +148,7 @@ def _verdict(
     names = accepted.effects if accepted else ()
     final = next((f for f in fits if f.effects == names), base)
     # A law that explains the landings knows their instants better than the poses do.
-    known = _error(final.residuals) < (1 + MATERIAL) ** 2
+    known = _error(final.residuals) < (1 + settings.SELECTION.material) ** 2
     impulses = _impulses(task, passages, final.own) if known else believed
     return Landings(
         found=found,
@@ -182,16 +187,16 @@ def _judged(
     )
     held_gain = 1 - errors[1] / was[1]
     reasons = []
-    if gained < EARNED:
-        reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
-    if significance < SIGNIFICANT or held_gain <= 0:
+    if gained < settings.SELECTION.earned:
+        reasons.append(f'evidence {gained:.1f} nats, {settings.SELECTION.earned:g} needed')
+    if significance < settings.SELECTION.significant or held_gain <= 0:
         reasons.append('no significant gain on landings held out')
     elif explained < NOTICEABLE:
         reasons.append(
             f'explains {explained:.2f} noise standard deviations, {NOTICEABLE:g} needed'
         )
     left = max(errors[1] - 1, 0.0)
-    if left > LEFT * max(was[1] - 1, 0.0) and errors[1] > AT_NOISE:
+    if left > LEFT * max(was[1] - 1, 0.0) and errors[1] > settings.NOISE.at_noise:
         reasons.append(f'leaves an error of {np.sqrt(errors[1]):.1f} noise standard deviations')
     reasons += _edges(fit)
     return LawTried(
@@ -219,7 +224,7 @@ def _edges(fit: ContactFit) -> list[str]:
 
 def _at_noise(fit: ContactFit, first: int) -> bool:
     return all(
-        (_per_output(part) < AT_NOISE).all()
+        (_per_output(part) < settings.NOISE.at_noise).all()
         for part in (fit.residuals[:first], fit.residuals[first:])
     )
 

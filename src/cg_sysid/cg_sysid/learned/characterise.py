@@ -24,6 +24,7 @@ from cg_sysid.learned.linear_response import cut, pieces_of, simulated_signals
 from cg_sysid.learned.residual_terms import BEYOND, Sketches, Term
 from cg_sysid.learned.shape import GRID, function_of, shape_of
 from cg_sysid.learned.unmodelled import Unmodelled
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, try_candidate
 from cg_sysid.search.model_selection import Comparison, ModelSelection, share_explained
 
@@ -35,7 +36,6 @@ WINDOW = 2.5  # pieces
 LEARNING_S = 40.0  # windows to learn from, all together; what is beyond adds little
 LONGEST_WINDOW = 1.25  # s
 STOOD_IN = 0.5  # share of the error that causes or a term must take from what is without them
-NEARLY_ALL = 0.9  # of the squared error above the noise: a cause of another shape than its law's
 OF_USE = 0.3  # share of the fall of the log error that causes must have beside a term
 NEGLIGIBLE = 0.05  # chi2 per sample above the noise; less is not compared
 WORSE = 3.0  # times the error on windows that a fit of whole records may leave
@@ -110,7 +110,7 @@ def _of_one_family(
     effects = [final.model.effect(label) for label in causes]
     site = term.effect.site.partition(':')[0]
     kin = any(e.family == term.effect.family and e.site in (site, 'all') for e in effects)
-    return kin and share_explained(nominal.held, final.held) > NEARLY_ALL
+    return kin and share_explained(nominal.held, final.held) > settings.DOUBT.nearly_all
 
 
 def _causes_stand(final: Outcome, alone: Unmodelled, beside: Unmodelled, sides: Sides) -> bool:

@@ -15,24 +15,10 @@ from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
 from cg_sysid.search import excerpt as excerpt
+from cg_sysid.search import settings
 from cg_sysid.search.events import seek_events, undisturbed
 from cg_sysid.search.nuisance import Bounds, turning
 from cg_sysid.text import measured
-
-SCREEN_ITERATIONS = 16
-ITERATIONS = 60
-THOROUGH_ITERATIONS = 72  # of the last fit
-MOST_STARTS = 24
-FOLLOWED = 3  # starts that are worth a second look
-FOLLOWING = 8  # iterations of each, before the best of them is chosen
-SAME = 1.01  # ratio of the errors of two fits that may be one minimum
-ALIKE = 0.1  # relative difference of an effect's parameters there
-SEEKINGS = 4  # times that the instants of an event are sought, each with better parameters
-WORTH_SEEKING = 0.9  # share of the error at which seeking again is not worth it
-SETTLED = 1.2  # chi2/N at which nothing is left to find
-PRIOR_CONFLICT = 4.0  # tolerances from which a number is not what the model file believes
-TOO_SMALL = 2.0  # standard deviations within which an effect's size may be none at all
-SURE = 5.0  # standard deviations from which an event of a record is not chance
 
 Start = tuple[Model, Fit | None]
 
@@ -62,7 +48,7 @@ class Task:
     events: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
     warm_starts: tuple[Fit, ...] = ()
-    iterations: int = ITERATIONS
+    iterations: int = settings.FITTING.iterations
     thorough: bool = False
     base: Fit | None = None
     first: Fit | None = None
@@ -141,7 +127,10 @@ def starts_of(name: str) -> list[dict[str, float]]:
         else [(p.name, p.default if p.neutral is None else p.neutral)]
         for p in LIBRARY[name].parameters
     ]  # fmt: skip
-    return [dict(point) for point in itertools.islice(itertools.product(*grids), MOST_STARTS)]
+    return [
+        dict(point)
+        for point in itertools.islice(itertools.product(*grids), settings.SCREENING.most_starts)
+    ]
 
 
 def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
@@ -167,7 +156,7 @@ def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
             warm_starts = tuple(
                 sorted([beyond, *warm_starts], key=lambda warm_start: warm_start.normalised_error)
             )
-            warm_starts = warm_starts[:FOLLOWED]
+            warm_starts = warm_starts[: settings.SCREENING.followed]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
     return Screening(
@@ -256,7 +245,7 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | str:
             own=o.events,
             bounds=o.task.bounds,
             thorough=True,
-            iterations=THOROUGH_ITERATIONS,
+            iterations=settings.FITTING.thorough_iterations,
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return str(error)
@@ -286,7 +275,7 @@ def _surest(found: Fit, label: str) -> list[np.ndarray]:
         for values, sigmas in zip(own, found.own_sigmas, strict=True)
     ]
     order = sorted(range(len(own)), key=lambda i: -sure[i])
-    return [own[i] for i in order[:FOLLOWED] if sure[i] > SURE]
+    return [own[i] for i in order[: settings.SCREENING.followed] if sure[i] > settings.EVENTS.sure]
 
 
 def _unseen_shapes(found: Fit) -> tuple[str, ...]:
@@ -353,13 +342,20 @@ def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
         return _whole(task, model, train, None, task.iterations)
     # The first seconds may mislead where the error has many minima: a resonance that is not
     # excited yet, a gap that is passed once.
-    best = _whole(task, _chosen(model, warm_starts[0]), train, warm_starts[0], FOLLOWING)
+    best = _whole(
+        task, _chosen(model, warm_starts[0]), train, warm_starts[0], settings.SCREENING.following
+    )
     for warm_start in warm_starts[1:]:
-        if best.normalised_error < SETTLED or warm_start.normalised_error > task.reach:
+        if (
+            best.normalised_error < settings.NOISE.settled
+            or warm_start.normalised_error > task.reach
+        ):
             break
-        other = _whole(task, _chosen(model, warm_start), train, warm_start, FOLLOWING)
+        other = _whole(
+            task, _chosen(model, warm_start), train, warm_start, settings.SCREENING.following
+        )
         best = min(best, other, key=lambda found: found.normalised_error)
-    left = task.iterations - FOLLOWING
+    left = task.iterations - settings.SCREENING.following
     if best.converged or left < 1:
         return best
     return _whole(task, _chosen(model, best), train, best, left)
@@ -404,7 +400,10 @@ def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
         screenings = _all_screened(
-            task, [(model, None) for _, model in screenings[:FOLLOWED]], train, []
+            task,
+            [(model, None) for _, model in screenings[: settings.SCREENING.followed]],
+            train,
+            [],
         )
     warm_starts: list[Fit] = []
     for screening, model in screenings:
@@ -413,7 +412,7 @@ def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
             for warm_start in warm_starts
         ):
             warm_starts.append(screening)
-    return tuple(warm_starts[:FOLLOWED])
+    return tuple(warm_starts[: settings.SCREENING.followed])
 
 
 def one_minimum(a: Fit, b: Fit, label: str) -> bool:
@@ -423,8 +422,10 @@ def one_minimum(a: Fit, b: Fit, label: str) -> bool:
          if u.name.startswith(f'{label}.')}
         for found in (a, b)
     )  # fmt: skip
-    near = a.normalised_error < SAME * b.normalised_error
-    alike = np.allclose(list(own.values()), [other.get(n, np.nan) for n in own], rtol=ALIKE)
+    near = a.normalised_error < settings.SCREENING.same * b.normalised_error
+    alike = np.allclose(
+        list(own.values()), [other.get(n, np.nan) for n in own], rtol=settings.SCREENING.alike
+    )
     return near and bool(alike)
 
 
@@ -434,7 +435,7 @@ def _event_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     settled = best or fit(task.model, train, own=task.events, bounds=task.bounds)
     nothing = settled.normalised_error
     settled = best or undisturbed(task.model, train, task.bounds) or settled
-    for _ in range(SEEKINGS if best else 1):
+    for _ in range(settings.EVENTS.seekings if best else 1):
         # What was a push is at first taken for other parameters: seek again when it is not.
         at = {u.name: float(v) for u, v in zip(settled.unknowns, settled.values, strict=True)}
         model = next(_starting_models(task))
@@ -444,10 +445,12 @@ def _event_fit(task: Task, train: Sequence[DataSet]) -> Fit:
         )
         if best is None or settled.normalised_error < best.normalised_error:
             best = settled
-        if best.normalised_error < SETTLED:
+        if best.normalised_error < settings.NOISE.settled:
             return fit(model, train, start=best, bounds=task.bounds)
     assert best is not None
-    found = bool(task.warm_starts) or best.normalised_error > WORTH_SEEKING * nothing
+    found = (
+        bool(task.warm_starts) or best.normalised_error > settings.EVENTS.worth_seeking * nothing
+    )
     return replace(best, converged=found)
 
 
@@ -457,13 +460,14 @@ def _screened(
     train: Sequence[DataSet],
     only: Sequence[str] | None = None,
     start: Fit | None = None,
-    length: float = excerpt.LENGTHS_S[0],
+    length: float | None = None,
 ) -> Fit:
     """A fit to a glimpse of the records: as long as the base's own look, if there is one."""
     few = [train[i] for i in excerpt.few(train)]
     return fit(
-        model, few, only, horizon=task.first.horizon if task.first else length,
-        iterations=SCREEN_ITERATIONS, start=start,
+        model, few, only,
+        horizon=task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0],
+        iterations=settings.SCREENING.iterations, start=start,
         own=task.events, bounds=task.bounds, reach=task.reach, sure=False,
     )  # fmt: skip
 
@@ -480,7 +484,7 @@ def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
             found = _screened(task, task.model, train, start=start, length=length)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
             break
-        if found.normalised_error > SETTLED:
+        if found.normalised_error > settings.NOISE.settled:
             break
     return found
 
@@ -497,7 +501,11 @@ def deeper(task: Task, warm_start: Fit, train: Sequence[DataSet]) -> Fit | None:
         found = _screened(task, task.model, train, start=start)
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
         return None
-    return found if SAME * found.normalised_error < task.first.normalised_error else None
+    return (
+        found
+        if settings.SCREENING.same * found.normalised_error < task.first.normalised_error
+        else None
+    )
 
 
 def _swept(model: Model) -> list[str]:
@@ -615,7 +623,7 @@ def events_in(
             for u, v, s in zip(found.own, values, sigmas, strict=True)
             if u.name.startswith(f'{label}.')
         }
-        if row and _sureness(row) > SURE:
+        if row and _sureness(row) > settings.EVENTS.sure:
             events[name] = row
     return events
 
@@ -637,7 +645,11 @@ def prior_conflicts(o: Outcome) -> dict[str, float]:
         for u, v in zip(o.train.unknowns, o.train.values, strict=True)
         if np.isfinite(u.tolerance) and u.name not in o.task.bounds
     }
-    return {name: tolerances for name, tolerances in away.items() if tolerances > PRIOR_CONFLICT}
+    return {
+        name: tolerances
+        for name, tolerances in away.items()
+        if tolerances > settings.PRIOR.conflict
+    }
 
 
 def too_small(o: Outcome) -> list[str]:
@@ -651,7 +663,7 @@ def too_small(o: Outcome) -> list[str]:
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
     # Within their bounds small faults may take any part of it: that says nothing of its size.
     beside = _sigma_beside(o.train, f'{o.label}.{first.name}', o.task.bounds)
-    if abs(value - first.neutral) > TOO_SMALL * min(sigma, beside):
+    if abs(value - first.neutral) > settings.SELECTION.too_small * min(sigma, beside):
         return []
     return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
 

@@ -19,16 +19,8 @@ from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.identification.data_set import DataSet, pieces
 from cg_sysid.identification.identify import Fit, fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, awake, own_unknowns
+from cg_sysid.search import settings
 from cg_sysid.search.nuisance import Bounds
-
-GRID_S = 0.2
-PIECE_S = 2.0  # of a record, in most of which nothing happens
-KEPT = 0.5  # share of the pieces that is kept at least
-QUIET = 1.2  # chi2/N of pieces that are all kept
-TRIMMINGS = 3  # times that a fit chooses its pieces
-PIECE_ITERATIONS = 8
-BEFORE_S = 0.5  # of a spoilt piece: what happened may have begun there
-FOLLOWED = 3  # peaks from which a fit goes on
 
 
 def seek_events(
@@ -57,7 +49,7 @@ def seek_events(
     seeking = _Seeking(model, names, known)
     guesses = [seeking.alone(data_set) for data_set in data_sets]
     # What happened in one record may have happened at the same time in another.
-    surest = sorted(guesses, key=lambda g: g.error / g.quiet)[:FOLLOWED]
+    surest = sorted(guesses, key=lambda g: g.error / g.quiet)[: settings.EVENTS.followed]
     others = [*elsewhere, *(g.event for g in surest if g.error < g.quiet)]
     guesses = [seeking.follow(t, g, others) for t, g in zip(data_sets, guesses, strict=True)]
     return {
@@ -81,18 +73,25 @@ def undisturbed(model: Model, data_sets: Sequence[DataSet], bounds: Bounds) -> F
     # which a first, spoilt fit loses.
     if own_unknowns(model) or any(TIME in effect.extra_inputs for effect in model.effects):
         return None
-    whole = [piece for t in data_sets for _, piece in pieces(model.mechanism, t, PIECE_S)]
+    whole = [
+        piece
+        for t in data_sets
+        for _, piece in pieces(model.mechanism, t, settings.EVENTS.piece_s)
+    ]
     kept, found = whole, None
     try:
-        for _ in range(TRIMMINGS):
-            found = fit(model, kept, bounds=bounds, iterations=PIECE_ITERATIONS)
+        for _ in range(settings.EVENTS.trimmings):
+            found = fit(model, kept, bounds=bounds, iterations=settings.EVENTS.piece_iterations)
             errors = _piece_errors(found.model, whole)
-            quiet = max(QUIET, float(np.quantile(errors, KEPT, method='lower')))
+            quiet = max(
+                settings.NOISE.settled,
+                float(np.quantile(errors, settings.EVENTS.kept, method='lower')),
+            )
             kept = [piece for piece, e in zip(whole, errors, strict=True) if e <= quiet]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
         return None
     spoilt = len(whole) - len(kept)
-    return found if spoilt and quiet == QUIET else None
+    return found if spoilt and quiet == settings.NOISE.settled else None
 
 
 def _piece_errors(model: Model, found: Sequence[DataSet]) -> np.ndarray:
@@ -181,7 +180,9 @@ def _small_events(
             gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
     peaks, _ = scipy.signal.find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
-    return [np.array([sizes[k], data_set.since + grid[k]]) for k in order[:FOLLOWED]]
+    return [
+        np.array([sizes[k], data_set.since + grid[k]]) for k in order[: settings.EVENTS.followed]
+    ]
 
 
 def _instants(model: Model, data_set: DataSet) -> np.ndarray:
@@ -189,13 +190,15 @@ def _instants(model: Model, data_set: DataSet) -> np.ndarray:
 
     All, or those about spoilt pieces.
     """
-    grid = np.arange(0.0, data_set.duration, GRID_S)
-    found = pieces(model.mechanism, data_set, PIECE_S)
+    grid = np.arange(0.0, data_set.duration, settings.EVENTS.grid_s)
+    found = pieces(model.mechanism, data_set, settings.EVENTS.piece_s)
     try:
         errors = _piece_errors(model, [piece for _, piece in found])
     except IdentificationError:
         return grid  # too short for pieces, or none can be simulated
-    bad = errors > QUIET * max(1.0, float(np.median(errors)))
+    bad = errors > settings.NOISE.settled * max(1.0, float(np.median(errors)))
     spoilt = np.array([begin for begin, _ in found])[bad]
-    near = (grid[:, None] > spoilt - BEFORE_S) & (grid[:, None] < spoilt + PIECE_S)
+    near = (grid[:, None] > spoilt - settings.EVENTS.before_s) & (
+        grid[:, None] < spoilt + settings.EVENTS.piece_s
+    )
     return grid[near.any(axis=1)] if len(spoilt) else grid

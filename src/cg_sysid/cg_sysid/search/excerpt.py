@@ -13,10 +13,7 @@ import numpy as np
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.unknowns import unsettled_states
-
-LENGTHS_S = (2.0, 5.0)  # of long records: the first of them in which the base fails
-ENOUGH_S = 10.0  # of short records
-FEWEST = 6  # of these, from each set-up
+from cg_sysid.search import settings
 
 
 def lengths(data_sets: Sequence[DataSet]) -> list[float]:
@@ -24,7 +21,7 @@ def lengths(data_sets: Sequence[DataSet]) -> list[float]:
     longest = max(data_set.duration for data_set in data_sets)
     if len(few(data_sets)) < len(data_sets):
         return [longest]
-    return [length for length in LENGTHS_S if longest >= 2 * length]
+    return [length for length in settings.SCREENING.lengths_s if longest >= 2 * length]
 
 
 def few(data_sets: Sequence[DataSet]) -> list[int]:
@@ -33,14 +30,16 @@ def few(data_sets: Sequence[DataSet]) -> list[int]:
     They are spread over all recordings of each set-up.
     """
     durations = [data_set.duration for data_set in data_sets]
-    if max(durations) >= 2 * LENGTHS_S[0]:
+    if max(durations) >= 2 * settings.SCREENING.lengths_s[0]:
         return list(range(len(data_sets)))
     groups: dict[str, list[int]] = {}
     for i, data_set in enumerate(data_sets):
         groups.setdefault(repr(data_set.setup), []).append(i)
-    every = int(sum(durations) / ENOUGH_S)
+    every = int(sum(durations) / settings.SCREENING.enough_s)
     taken = [
-        i for group in groups.values() for i in group[:: max(1, min(every, len(group) // FEWEST))]
+        i
+        for group in groups.values()
+        for i in group[:: max(1, min(every, len(group) // settings.SCREENING.fewest_records))]
     ]
     return sorted(taken) if 2 * len(taken) <= len(data_sets) else list(range(len(data_sets)))
 

@@ -11,6 +11,7 @@ import numpy as np
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
     at_edge,
@@ -22,32 +23,7 @@ from cg_sysid.search.candidates import (
     undetermined_size,
 )
 from cg_sysid.search.nuisance import as_sound_robots, faults_among
-from cg_sysid.search.ranking import MARGIN, Candidate, contains, per_output
-
-# Rivals whose chi2/N differ by less than this share are not told apart, however many samples say
-# so: it is the order of what integrators and interpolation differ by.
-FIDELITY = 1.5e-3
-# The same for thorough fits to all records: their late torques change at their own instants, and
-# half their steps move chi2 by no more than 1e-6 of it.
-THOROUGH_FIDELITY = 1e-4
-# Those that may be rivals and are fitted thoroughly: a late torque that changes between rows, and
-# readings that are late instead, differ by so much before.
-COARSE_FIDELITY = 2e-2
-# A model that leaves more than white noise has something wrong, and small differences say less.
-ROUGH_FIDELITY = 2e-3
-WHITE = 0.9  # share of independent samples from which a residual counts as white noise
-EARNED = 10.0  # nats an effect must gain over the model without it
-MATERIAL = 1.0  # an effect must explain this much error, in standard deviations of the noise
-QUIETEST = 0.9  # chi2/N of an output of which nothing is wrong, at least
-HALF_SEEN = 0.3  # of what has to be explained on held-out records, at least on those fitted to
-AT_NOISE = 1.3  # chi2/N up to which a channel counts as explained down to noise
-SIGNIFICANT = 2.5  # standard errors by which the held-out error must fall, block by block
-FEWEST_BLOCKS = 20  # short records are cut into shorter blocks, but not below
-SHORTEST_BLOCK_S = 0.1
-ACCOUNTS = 0.5  # of the squared error above the noise: who takes less does not explain it
-MISHAP = 1 / 3  # of the error above the noise: what single mishaps leave at most, if they are it
-SAYS_MORE = 4.0  # independent samples of a record for each value that it has of its own
-BLOCK_S = 0.5  # length of the blocks on which a held-out gain is tested
+from cg_sysid.search.ranking import Candidate, contains, per_output
 
 
 @dataclass(frozen=True)
@@ -117,7 +93,10 @@ class ModelSelection:
         self.data_sets = data_sets
         self.steps = [float(np.median(np.diff(data_set.time))) for data_set in data_sets]
         judged = sum(data_set.duration for data_set in held)
-        block = min(BLOCK_S, max(judged / FEWEST_BLOCKS, SHORTEST_BLOCK_S))
+        block = min(
+            settings.SELECTION.block_s,
+            max(judged / settings.SELECTION.fewest_blocks, settings.SELECTION.shortest_block_s),
+        )
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
     def compare(
@@ -132,7 +111,7 @@ class ModelSelection:
                 there is none. If all went through they rank the outcomes.
         """
         if not outcomes:
-            return Comparison(base, (), 2.0, MARGIN)
+            return Comparison(base, (), 2.0, settings.SELECTION.margin)
         leader = min([base, *outcomes], key=chi2)
         independent = independent_samples(leader.residuals, self.steps)
         reference = _evidence(base, independent)
@@ -149,10 +128,10 @@ class ModelSelection:
             for own, o in zip(found, outcomes, strict=True)
         ]
         ranked.sort(key=lambda pair: -pair[0].evidence)
-        white = independent > WHITE * samples(leader)
-        fine = THOROUGH_FIDELITY if to_all else FIDELITY
-        fidelity = fine if white else ROUGH_FIDELITY
-        margin = max(MARGIN, fidelity * independent / 2)
+        white = independent > settings.NOISE.white * samples(leader)
+        fine = settings.SELECTION.thorough_fidelity if to_all else settings.SELECTION.fidelity
+        fidelity = fine if white else settings.SELECTION.rough_fidelity
+        margin = max(settings.SELECTION.margin, fidelity * independent / 2)
         if at_noise(base) and not self.imitated(base):
             # Beliefs decide, and those are rough: whatever relieves them is a rival.
             margin = float('inf')
@@ -167,41 +146,43 @@ class ModelSelection:
         explained = explained_by(base, o)
         held_gain = 1 - o.held.normalised_error / base.held.normalised_error
         reasons = []
-        if gained < EARNED:
-            reasons.append(f'evidence {gained:.1f} nats, {EARNED:g} needed')
+        if gained < settings.SELECTION.earned:
+            reasons.append(f'evidence {gained:.1f} nats, {settings.SELECTION.earned:g} needed')
         imitated = self.imitated(base)
         if at_noise(base) and not imitated:
             # No error is left to explain, but numbers that nobody believes.
             if prior_conflicts(o) or not at_noise(o):
                 reasons.append('leaves numbers far from what the model file believes')
-        elif significance < SIGNIFICANT or held_gain <= 0:
+        elif significance < settings.SELECTION.significant or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
         elif (
-            explained < MATERIAL
+            explained < settings.SELECTION.material
             and not (prior_conflicts(base) and not prior_conflicts(o))
             and not (imitated and self._white(o))
         ):
             reasons.append(
-                f'explains {explained:.2f} noise standard deviations, {MATERIAL:g} needed'
+                f'explains {explained:.2f} noise standard deviations, '
+                f'{settings.SELECTION.material:g} needed'
             )
         each = _own_values(o) / len(self.steps)
         eventful = any(u.each == 'record' for u in o.train.own)
-        if eventful and independent < SAYS_MORE * each * len(self.steps):
+        if eventful and independent < settings.SELECTION.says_more * each * len(self.steps):
             # With a push of its own a short record is matched whatever is wrong, held out or not.
             reasons.append(
                 f'records of {independent / len(self.steps):.0f} independent samples cannot '
                 f"judge {each:.0f} values of each record's own"
             )
         left = above_noise(o) / max(above_noise(base), 1e-300)
-        if eventful and not at_noise(o) and left > MISHAP:
+        if eventful and not at_noise(o) and left > settings.SELECTION.mishap:
             # A push in every record takes the edge off whatever is wrong all the time.
             reasons.append(
-                f'leaves {100 * left:.0f} % of the error, at most {100 * MISHAP:.0f} % allowed'
+                f'leaves {100 * left:.0f} % of the error, at most '
+                f'{100 * settings.SELECTION.mishap:.0f} % allowed'
             )
         own = own_parameters(o)
         reasons += at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
-        if at_noise(base) or left > 1 - ACCOUNTS or not _known_at_all(o):
+        if at_noise(base) or left > 1 - settings.SELECTION.accounts or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
         reasons += as_sound_robots(o.label, own)
         reasons += self._implausible(o)
@@ -243,7 +224,9 @@ class ModelSelection:
         """True if so little is left that nothing could explain MATERIAL of it."""
         if prior_conflicts(o) or self.imitated(o):
             return False  # beliefs decide, or whiteness
-        return bool(per_output(o.held).max() < QUIETEST + MATERIAL**2)
+        return bool(
+            per_output(o.held).max() < settings.NOISE.quietest + settings.SELECTION.material**2
+        )
 
     def to_be_earned(self, base: Outcome) -> float:
         """chi2/N of training records that a fit on top of a base has to come to, to be earned.
@@ -254,12 +237,12 @@ class ModelSelection:
         if prior_conflicts(base) or self.imitated(base):
             return np.inf
         count = base.train.count.sum(axis=0)
-        least = MATERIAL**2 * float(count.min() / count.sum())
+        least = settings.SELECTION.material**2 * float(count.min() / count.sum())
         error = base.train.normalised_error
-        return error - HALF_SEEN * min(least, max(error - 1.0, 0.0))
+        return error - settings.SELECTION.half_seen * min(least, max(error - 1.0, 0.0))
 
     def _white(self, o: Outcome) -> bool:
-        return independent_samples(o.residuals, self.steps) > WHITE * samples(o)
+        return independent_samples(o.residuals, self.steps) > settings.NOISE.white * samples(o)
 
 
 def explained_by(base: Outcome, o: Outcome) -> float:
@@ -301,7 +284,10 @@ def settled(o: Outcome) -> bool:
 
 def at_noise(o: Outcome) -> bool:
     """True if every output is simulated down to noise, in training and on records held out."""
-    return bool((per_output(o.train) < AT_NOISE).all() and (per_output(o.held) < AT_NOISE).all())
+    return bool(
+        (per_output(o.train) < settings.NOISE.at_noise).all()
+        and (per_output(o.held) < settings.NOISE.at_noise).all()
+    )
 
 
 def samples(o: Outcome) -> float:

@@ -8,8 +8,6 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.identification.identify import Fit
 
-MARGIN = 6.0  # nats: rivals closer than this are not told apart (odds of 400 to 1)
-
 
 @dataclass(frozen=True)
 class Candidate:

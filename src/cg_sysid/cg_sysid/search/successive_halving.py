@@ -16,10 +16,8 @@ import numpy as np
 
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
-    FOLLOWED,
-    SAME,
-    SETTLED,
     Outcome,
     Screening,
     Task,
@@ -37,19 +35,6 @@ from cg_sysid.search.nuisance import nuisances
 
 log = logging.getLogger(__name__)
 
-RUNGS = (8, 16, 36)  # iterations on whole records; after each only those go on that may still win
-IN_REACH = 10.0  # times the smallest error, from which a short or unfinished fit may still win
-NEAR = 3.0  # the same where that error is the noise
-AS_GOOD = 1.2  # times what is to be beaten, from which a candidate does not come up to it
-HOPE = 10.0  # times what the last rung gained, from which it may still win
-NOTHING_LEFT = 1.03  # chi2/N at which no record can hold an event of its own
-FAVOURED = 2.0  # times what the best look leaves above the noise, to be fitted first
-MOST = 3.0  # an error that is so many times smaller is mostly explained
-IDLE = 0.3  # of what the best explains: who explains less is idle beside it
-MUCH = 1.5  # chi2/N of a model of which much is wrong
-HEAVY = 10  # cost from which a candidate is looked at when the others have been
-FIRST_FEW = 8  # of the light candidates, that may show that the base was in a local minimum
-FEWEST = 5  # candidates that are fitted to whole records whatever the first look says
 
 CarryOut = Callable[[Callable, list[tuple], str], list]
 Effects = Sequence[tuple[str, str | None]]
@@ -133,15 +118,23 @@ class SuccessiveHalving:
         if events and _nothing_helps(base, screenings) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
         # What is on top of a base has to come below it.
-        known = min(NEAR * min(_best(found), _smallest(screenings)), AS_GOOD * beaten)
+        known = min(
+            settings.HALVING.near * min(_best(found), _smallest(screenings)),
+            settings.HALVING.as_good * beaten,
+        )
         reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
-        heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= HEAVY]
+        heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= settings.HALVING.heavy]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         for limit in (_favoured(_smallest(screenings)), np.inf):
             best = _best(found)
-            reach = min(_reach(best), AS_GOOD * beaten, worth_having(best, base.base), earned)
-            fewest = FEWEST if np.isinf(beaten) else 0
+            reach = min(
+                _reach(best),
+                settings.HALVING.as_good * beaten,
+                worth_having(best, base.base),
+                earned,
+            )
+            fewest = settings.HALVING.fewest if np.isinf(beaten) else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
                     if screening.label not in tried and _known(screening) <= limit]  # fmt: skip
             tried.update(screening.label for screening in heat)
@@ -150,7 +143,9 @@ class SuccessiveHalving:
             )
         # To seek events in every record takes long: first what explains most of the error.
         best = min(_best(found), beaten)
-        if base.base is None or best > max(NOTHING_LEFT, _error(base.base) / MOST):
+        if base.base is None or best > max(
+            settings.NOISE.nothing_left, _error(base.base) / settings.HALVING.mostly
+        ):
             found |= self._fitted(events, f'{what}, events')
         found |= self._in_more_depth(found, base.base, beaten, earned, what)
         return list(found.values()), [
@@ -168,7 +163,7 @@ class SuccessiveHalving:
         """Ever longer fits of those that may still win."""
         found, beaten = dict(found), min(beaten, _error(base))
         gained: dict[str, float] = {}
-        for iterations in RUNGS[1:]:
+        for iterations in settings.HALVING.rungs[1:]:
             limit = min(earned, worth_having(_best(found), base))
             going = _may_still_win(found, gained, beaten, limit)
             again = self._fitted(
@@ -195,18 +190,20 @@ class SuccessiveHalving:
         """
         if base.first is None:
             return None
-        if _error(base.first) < SETTLED < _error(base.base):
+        if _error(base.first) < settings.NOISE.settled < _error(base.base):
             return base.first
         light = _light(_on_top(base, effects))
         found: list[Fit] = []
         # Many lead the same way: the first few may do.
-        for tasks in (light[-FIRST_FEW:], light[:-FIRST_FEW]):
+        for tasks in (light[-settings.HALVING.first_few :], light[: -settings.HALVING.first_few]):
             screenings = self.screen(tasks, f'first look at {what}')
-            limit = base.first.normalised_error / SAME
-            best = sorted((k for k in screenings if _known(k) < limit), key=_known)[:FOLLOWED]
+            limit = base.first.normalised_error / settings.SCREENING.same
+            best = sorted((k for k in screenings if _known(k) < limit), key=_known)[
+                : settings.SCREENING.followed
+            ]
             arguments = [(base, screening.task.warm_starts[0], self.train) for screening in best]
             found += filter(None, self.carry_out(deeper, arguments, f'{what}, and without them'))
-            if any(fit.normalised_error < SETTLED for fit in found):
+            if any(fit.normalised_error < settings.NOISE.settled for fit in found):
                 break
         return min(found, key=lambda fit: fit.normalised_error, default=None)
 
@@ -248,12 +245,16 @@ def _causes(base: Task) -> frozenset[str]:
 
 
 def _on_top(base: Task, effects: Effects) -> list[Task]:
-    return [replace(base, effect=effect, iterations=RUNGS[0]) for effect in effects]
+    return [
+        replace(base, effect=effect, iterations=settings.HALVING.rungs[0]) for effect in effects
+    ]
 
 
 def _light(tasks: Iterable[Task]) -> list[Task]:
     """Those that are looked at before the heavy ones, the longest first."""
-    return _longest_first(t for t in tasks if not eventful(t) and cost_of(t) < HEAVY)
+    return _longest_first(
+        t for t in tasks if not eventful(t) and cost_of(t) < settings.HALVING.heavy
+    )
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
@@ -280,12 +281,14 @@ def _best(found: Mapping[str, Outcome]) -> float:
 
 def _reach(best: float) -> float:
     """chi2/N within which a fit may still win over one that came to `best`."""
-    return (NEAR if best < NOTHING_LEFT else IN_REACH) * best
+    return (
+        settings.HALVING.near if best < settings.NOISE.nothing_left else settings.HALVING.in_reach
+    ) * best
 
 
 def _favoured(best: float) -> float:
     """chi2/N up to which a look is as good as one that came to `best`."""
-    return max(SAME * best, 1 + FAVOURED * (best - 1))
+    return max(settings.SCREENING.same * best, 1 + settings.HALVING.favoured * (best - 1))
 
 
 def worth_having(best: float, base: Fit | None) -> float:
@@ -295,7 +298,7 @@ def worth_having(best: float, base: Fit | None) -> float:
     for the next round.
     """
     error = _error(base)
-    return error - IDLE * (error - best) if best < error < np.inf else error
+    return error - settings.HALVING.idle * (error - best) if best < error < np.inf else error
 
 
 def _clear(best: float, first: Fit | None) -> float:
@@ -304,14 +307,21 @@ def _clear(best: float, first: Fit | None) -> float:
     The first seconds of records are not all of them: what explains a little more there says
     nothing about the others.
     """
-    return best if best - 1 < (_error(first) - 1) / MOST else np.inf
+    return best if best - 1 < (_error(first) - 1) / settings.HALVING.mostly else np.inf
 
 
 def _nothing_helps(base: Task, screenings: Sequence[Screening]) -> bool:
     """Whether much is wrong that nothing explains in the first seconds."""
-    if base.base is None or base.first is None or base.base.normalised_error < MUCH:
+    if (
+        base.base is None
+        or base.first is None
+        or base.base.normalised_error < settings.NOISE.much_wrong
+    ):
         return False
-    return base.first.normalised_error < MUCH or _smallest(screenings) > MUCH
+    return (
+        base.first.normalised_error < settings.NOISE.much_wrong
+        or _smallest(screenings) > settings.NOISE.much_wrong
+    )
 
 
 def _worth_more(
@@ -321,7 +331,9 @@ def _worth_more(
     errors = sorted(filter(np.isfinite, map(_known, screenings)))
     if not errors:
         return list(screenings)
-    reach = min(reach, IN_REACH * errors[0], worth_having(_clear(errors[0], first), first))
+    reach = min(
+        reach, settings.HALVING.in_reach * errors[0], worth_having(_clear(errors[0], first), first)
+    )
     limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
     return [screening for screening in screenings if not screening.error > limit]
 
@@ -332,12 +344,16 @@ def _may_still_win(
     """Unfinished fits that are near the best, and do not come nearer too slowly."""
     best = min(map(chi2, found.values()), default=0.0)
     # What did not come below its base in eight iterations will not.
-    limit = min(worth, beaten / SAME if _best(found) < NOTHING_LEFT else np.inf)
+    limit = min(
+        worth,
+        beaten / settings.SCREENING.same if _best(found) < settings.NOISE.nothing_left else np.inf,
+    )
     going = [
         o for label, o in found.items()
-        if not o.train.converged and chi2(o) < IN_REACH * min(best, beaten * samples(o))
+        if not o.train.converged
+        and chi2(o) < settings.HALVING.in_reach * min(best, beaten * samples(o))
         and o.train.normalised_error < limit
-        and (label not in gained or chi2(o) - best <= HOPE * gained[label])
+        and (label not in gained or chi2(o) - best <= settings.HALVING.hope * gained[label])
     ]  # fmt: skip
     # Where nobody else is after it the best has won.
     return [] if [chi2(o) for o in going] == [best] else going
