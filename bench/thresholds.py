@@ -2,9 +2,9 @@
 
     ./cg exec python bench/thresholds.py [--stages NOISE,SELECTION] [--cases 6] [--write FILE]
 
-The recordings are those of hidden_effects.py, one machine a case: an effect, two effects, one among
-small faults, nothing, nothing but small faults. For each threshold of cg_sysid/search/settings.py
-both values are tried, and the cases are told whose verdict or causes (rivals included) change. A
+The recordings are those of hidden_effects.py, one machine a case: an effect, two effects, one
+among small faults, nothing, nothing but small faults. For each threshold of search/settings.py both
+values are tried, and the cases are told whose verdict or causes (rivals included) change. A
 threshold that changes none in many cases is there for speed, or goes. Integers move by at least
 one. Each process takes one value; --workers of them run side by side.
 """
@@ -95,15 +95,16 @@ def main():
                 for (effects, faults), old, new in zip(CASES, usual, found, strict=False)
                 if old != new
             ]
-            lines.append(f'| {stage.lower()}.{field} | {factor:g} | {"<br>".join(changed) or "none"} '
-                         f'| {cpu / took:.2f} |')  # fmt: skip
+            told = '<br>'.join(changed) or 'none'
+            lines.append(f'| {stage.lower()}.{field} | {factor:g} | {told} | {cpu / took:.2f} |')
             print(lines[-1], flush=True)
     if options.write:
         options.write.write_text('\n'.join([
             '# What thresholds decide', '',
-            'Command: `./cg exec python bench/thresholds.py`. Each threshold times 0.7 and 1.3, one '
-            f'at a time, on {options.cases} machines; usual answers: '
-            + ', '.join(f'{v} {"; ".join(" or ".join(c) for c in cs)}' for v, cs in usual) + '.', '',
+            'Command: `./cg exec python bench/thresholds.py`. Each threshold times 0.7 and 1.3, '
+            f'one at a time, on {options.cases} machines; usual answers: '
+            + ', '.join(f'{v} {"; ".join(" or ".join(c) for c in cs)}' for v, cs in usual)
+            + '.', '',
             '| threshold | times | answers that change | CPU time, ratio |',
             '|---|---:|---|---:|', *lines, '',
         ]))  # fmt: skip
