@@ -2,11 +2,11 @@
 
     ./cg exec python bench/thresholds.py [--stages NOISE,SELECTION] [--cases 6] [--write FILE]
 
-The recordings are those of hidden_effects.py, one machine a case: an effect, two effects, one
-among small faults, nothing, nothing but small faults. For each threshold of search/settings.py both
-values are tried, and the cases are told whose verdict or causes (rivals included) change. A
-threshold that changes none in many cases is there for speed, or goes. Integers move by at least
-one. Each process takes one value; --workers of them run side by side.
+The recordings are those of hidden_effects.py, one machine a case: an effect, two, one among small
+faults, nothing, nothing but small faults. For each threshold of search/settings.py both values are
+tried, and the cases are told whose verdict or causes (rivals included) change. A threshold that
+changes none in many cases is there for speed, or goes. Integers move by at least one. Each process
+takes one value; --workers of them run side by side.
 """
 
 import argparse

@@ -302,7 +302,7 @@ def extended_model(answer: Diagnosis, facts: Facts) -> Model:
             'created': origin['created'],
             'parent': Path(origin['model_file']).name,
             'parent_sha256': origin['model_sha256'],
-            'verdict': answer.verdict,
+            'verdict': str(answer.verdict),
             'causes': [cause.label for cause in answer.causes],
             'records': [
                 {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']

@@ -62,7 +62,7 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     verdict = verdict_of(causes, bool(left), share)
     late = (
         told_late_samples(work, gained(work, nominal, final))
-        if verdict is Verdict.UNEXPLAINED
+        if verdict == Verdict.UNEXPLAINED
         else ''
     )
     return answer(work, nominal, final, causes, verdict, unmodelled, wandering, late)

@@ -32,7 +32,7 @@ def answer_so_far(work: Workspace, nominal: Outcome) -> Diagnosis:
     causes = [cause_among(final, label, comparisons) for label in sorted(work.added(final))]
     left = bool(work.left(final))
     verdict = verdict_of(causes, left, share_explained(nominal.held, final.held))
-    if verdict is Verdict.UNEXPLAINED:
+    if verdict == Verdict.UNEXPLAINED:
         verdict = Verdict.UNFINISHED
     return answer(work,
         nominal, final, sorted(causes, key=lambda cause: -cause.evidence), verdict,

@@ -44,7 +44,7 @@ def summary_of(
         explained: Share of the squared error above the noise that the causes take.
         late: What errors of timing make of an error that stays unexplained, as a sentence.
     """
-    if verdict is Verdict.CONSISTENT:
+    if verdict == Verdict.CONSISTENT:
         text = 'The model explains the records down to the noise of the sensors'
         if max(g.before / g.after for g in gains) > NO_GAIN:
             text += (
@@ -55,7 +55,7 @@ def summary_of(
             text += f', but with {", ".join(prior_conflicts)} far from what its file believes'
         return f'{text}.'
     biggest = max(gains, key=lambda g: g.before / g.noise)
-    if verdict is Verdict.UNEXPLAINED:
+    if verdict == Verdict.UNEXPLAINED:
         known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
         whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
         text = (
@@ -71,7 +71,7 @@ def summary_of(
             )
         return f'{text} {late}' if late else text
     named = ', '.join(described(c) for c in causes)
-    if verdict is Verdict.UNFINISHED:
+    if verdict == Verdict.UNFINISHED:
         text = (
             f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
             f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '

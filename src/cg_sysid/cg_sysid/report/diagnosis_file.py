@@ -71,7 +71,7 @@ def diagnosis_facts(
         {
             **_head(
                 DIAGNOSIS,
-                diagnosis.verdict,
+                str(diagnosis.verdict),
                 diagnosis.summary + _in_spite_of(loaded),
                 diagnosis.nominal,
             ),
