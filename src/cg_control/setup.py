@@ -26,7 +26,7 @@ def shared(*folders):
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='Control of the compass-gait robot',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',

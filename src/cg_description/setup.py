@@ -14,7 +14,7 @@ def shared(*folders):
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='The compass-gait robot as data',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',

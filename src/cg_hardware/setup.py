@@ -22,7 +22,7 @@ def shared(*folders):
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='Hardware of the compass-gait robot, real and simulated',
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
