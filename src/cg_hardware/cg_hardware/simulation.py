@@ -16,7 +16,7 @@ from cg_dynamics.rig import Setup
 from cg_interfaces.settings import Settings, setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
-SOFTWARE = 'compass-gait 0.1.0'
+SOFTWARE = 'compass-gait 0.2.0'
 NANOSECONDS = 1_000_000_000
 CATCH_UP = 2.0  # simulated s per s that a late machine takes at most
 LOCKSTEP_EPOCH_NS = NANOSECONDS  # simulated time starts at 1 s: a stamp of zero means "unset"

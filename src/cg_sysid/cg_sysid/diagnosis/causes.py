@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 def named_causes(work: Workspace, nominal: Outcome, final: Outcome) -> list[Cause]:
     """What was added to the nominal model, each judged in its place, the strongest first."""
     causes = []
-    for label in work.added(final):
+    for label in sorted(work.added(final)):
         comparison = without(work, nominal, final, label)
         if comparison is None:
             causes.append(Cause(label, parameters_of(final, label), float('inf')))
