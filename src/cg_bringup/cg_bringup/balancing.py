@@ -13,7 +13,7 @@ import numpy as np
 from cg_control.balance import BALANCING, BalanceController
 from cg_control.recovery import TreeController
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.mechanisms import CompassGait
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimator

@@ -25,7 +25,7 @@ from cg_control.tracking import LEAST_TURN, Tracker, TrackingSettings
 from cg_dynamics.assemble import acting_effects, parameter_vector, stamped
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
-from cg_dynamics.mechanisms import CompassGait
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model

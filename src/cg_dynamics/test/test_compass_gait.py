@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.mechanisms import CompassGait
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model
 

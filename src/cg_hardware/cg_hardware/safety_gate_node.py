@@ -40,9 +40,7 @@ from cg_interfaces.settings import setting
 class GateNodeSettings(GateSettings):
     """Parameters of the gate node."""
 
-    mechanism: str = setting(
-        'compass_gait', 'mechanism whose joints are guarded', choices=tuple(channels.MECHANISMS)
-    )
+    mechanism: str = setting('compass_gait', 'mechanism whose joints are guarded')
 
 
 class SafetyGateNode(Node):

@@ -24,21 +24,19 @@ class SensorPublishers:
             variances: Channel -> variance of its noise, for the covariances of the IMU.
         """
         self.joints = channels.mechanism(mechanism).joints
-        self._publish_parts = {
-            'compass_gait': self._publish_compass_gait,
-            'pendulum': self._publish_pendulum,
-            'double_pendulum': self._publish_double_pendulum,
-        }[mechanism]
+        walks = mechanism == 'compass_gait'
+        self._publish_parts = self._publish_compass_gait if walks else self._publish_joints
         self.applied = JointState(name=list(self.joints))
         self.applied.header.frame_id = channels.mechanism(mechanism).torque.frame_id
         self.publishers: dict[str, Any] = {}
         self._publisher(node, JointState, topics.APPLIED_TORQUE)
-        if mechanism == 'compass_gait':
+        if walks:
             self._prepare_compass_gait(node, variances)
         else:
             self._publisher(node, JointState, topics.JOINT_STATES)
-            self.joint_states = JointState(name=list(self.joints))
-            self.joint_states.header.frame_id = channels.mechanism(mechanism).torque.frame_id
+            (self.read,) = channels.mechanism(mechanism).outputs
+            self.joint_states = JointState(name=[c.joint for c in self.read.channels])
+            self.joint_states.header.frame_id = self.read.frame_id
 
     def _publisher(self, node: Node, kind: type, topic: str) -> None:
         self.publishers[topic] = node.create_publisher(kind, topic, MACHINE_QOS)
@@ -113,17 +111,10 @@ class SensorPublishers:
         self.imu.angular_velocity.y = float(measurement.outputs['imu_rate'])
         self._send(topics.IMU, self.imu)
 
-    def _publish_joints(self, stamp: Any, positions: list[float]) -> None:
+    def _publish_joints(self, stamp: Any, measurement: Any) -> None:
         self.joint_states.header.stamp = stamp
-        self.joint_states.position = positions
+        self.joint_states.position = [measurement.outputs[c.name] for c in self.read.channels]
         self._send(topics.JOINT_STATES, self.joint_states)
-
-    def _publish_pendulum(self, stamp: Any, measurement: Any) -> None:
-        self._publish_joints(stamp, [measurement.outputs['angle']])
-
-    def _publish_double_pendulum(self, stamp: Any, measurement: Any) -> None:
-        outputs = measurement.outputs
-        self._publish_joints(stamp, [outputs['shoulder_angle'], outputs['elbow_angle']])
 
 
 def torques_of(message: JointState, joints: tuple[str, ...]) -> list[float]:

@@ -8,9 +8,12 @@ work on any object that has the fields of the ROS message: those of `rosbags`, o
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import atan2, cos, isfinite, sin, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cg_interfaces import topics
+
+if TYPE_CHECKING:
+    from cg_dynamics.mechanisms import Mechanism as Body
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 IMU = 'sensor_msgs/msg/Imu'
@@ -185,13 +188,50 @@ MECHANISMS = _define_mechanisms()
 def mechanism(name: str) -> Mechanism:
     """The mechanism of that name.
 
+    One that has no row in the table has the topics of any machine of joints: torques, a switch of
+    its drive, and an encoder for each output on /joint_states.
+
     Raises:
         ValueError: No such mechanism; the message lists those there are.
     """
-    if name not in MECHANISMS:
-        msg = f'unknown mechanism {name!r}; known are {", ".join(MECHANISMS)}'
+    if name in MECHANISMS:
+        return MECHANISMS[name]
+    from cg_dynamics.mechanisms import MECHANISMS as BODIES  # symbols: nodes start without
+
+    if name not in BODIES:
+        msg = f'unknown mechanism {name!r}; known are {", ".join({**MECHANISMS, **BODIES})}'
         raise ValueError(msg)
-    return MECHANISMS[name]
+    return _of_joints(BODIES[name])
+
+
+def _of_joints(body: 'Body') -> Mechanism:
+    """The topics of a machine of joints, each output that of an encoder.
+
+    The encoder of a joint that is driven has its name, any other that of its coordinate.
+    """
+    frame = next(iter(body.joints)) if len(body.joints) == 1 else 'base'
+    driven = {tuple(row): joint for joint, row in body.joints.items()}
+    torques = tuple(
+        Channel(channel, unit, 'effort', joint)
+        for channel, unit, joint in zip(body.inputs, body.input_units, body.joints, strict=True)
+    )
+    count = len(body.coordinates)
+    angles = []
+    for k, (channel, unit) in enumerate(zip(body.outputs, body.output_units, strict=True)):
+        if body.sensor_kinds[channel] != 'encoder' or k >= count:
+            msg = (
+                f'{body.name}: output {channel!r} is no encoder of a coordinate; its topics '
+                'need a row in cg_interfaces/channels.py'
+            )
+            raise ValueError(msg)
+        row = tuple(float(i == k) for i in range(count))
+        angles.append(Channel(channel, unit, 'position', driven.get(row, body.coordinates[k])))
+    return Mechanism(
+        body.name,
+        *_torque_topics(frame, torques),
+        (_drive_enabled(frame),),
+        (Topic(topics.JOINT_STATES, JOINT_STATE, frame, tuple(angles)),),
+    )
 
 
 def pitch_from_quaternion(x: float, y: float, z: float, w: float) -> float:

@@ -66,7 +66,7 @@ def test_command_line_writes_it_or_says_what_there_is(capsys):
     said = capsys.readouterr()
     assert said.out == ''
     assert 'unicycle' in said.err
-    assert 'compass_gait, pendulum' in said.err
+    assert 'compass_gait, double_pendulum, pendulum' in said.err
 
 
 def test_reference_is_up_to_date():

@@ -8,8 +8,6 @@ from cart_pole import FILE, cart, install
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_interfaces import channels, topics
-from cg_interfaces.channels import JOINT_STATE, Channel, Mechanism, Topic
 from cg_sysid.checks.loading import load_bags
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.cli.diagnose import diagnosis_curves
@@ -24,24 +22,11 @@ from cg_sysid.report import render
 from cg_sysid.report.diagnosis_file import diagnosis_facts
 from cg_sysid.report.signals import payload
 
-FORCE = (Channel('force', 'N', 'effort', 'rail'),)
-TOPICS = Mechanism(
-    'cart_pole',
-    *(Topic(name, JOINT_STATE, 'rail', FORCE, required=name == topics.APPLIED_TORQUE)
-      for name in (topics.APPLIED_TORQUE, topics.TORQUE_COMMAND)),
-    (),
-    (Topic('/joint_states', JOINT_STATE, 'rail', (
-        Channel('position', 'm', 'position', 'rail'),
-        Channel('angle', 'rad', 'position', 'pole'),
-    )),),
-)  # fmt: skip
-
 
 @pytest.fixture
 def bags(monkeypatch, tmp_path):
     """Two bags of a cart that rubs with the square of its rate as well."""
     install(monkeypatch)
-    monkeypatch.setitem(channels.MECHANISMS, 'cart_pole', TOPICS)
     machine = cart().with_effect('quadratic_friction', coefficient=1.5)
     return [
         write_bag(tmp_path / f'ride_{k}', rehearse(

@@ -1,16 +1,28 @@
-"""The rigid-body mechanisms, by name."""
+"""The rigid-body mechanisms, by name. A new one is one class in one file of this folder.
+
+Every module here that defines a subclass of `Mechanism` with a name is found by itself.
+"""
+
+import importlib
+import pkgutil
 
 from cg_dynamics.errors import ModelError
-from cg_dynamics.mechanisms.compass_gait import CompassGait
-from cg_dynamics.mechanisms.double_pendulum import DoublePendulum
 from cg_dynamics.mechanisms.mechanism import Mechanism
-from cg_dynamics.mechanisms.pendulum import Pendulum
 
-MECHANISMS: dict[str, Mechanism] = {
-    mechanism.name: mechanism for mechanism in (CompassGait(), Pendulum(), DoublePendulum())
-}
+__all__ = ['MECHANISMS', 'Mechanism', 'mechanism']
 
-__all__ = ['MECHANISMS', 'CompassGait', 'DoublePendulum', 'Mechanism', 'Pendulum', 'mechanism']
+
+def _library() -> dict[str, Mechanism]:
+    found: dict[str, Mechanism] = {}
+    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        contents = vars(importlib.import_module(f'{__name__}.{module}'))
+        for item in contents.values():
+            if isinstance(item, type) and issubclass(item, Mechanism) and 'name' in vars(item):
+                found[item.name] = item()
+    return found
+
+
+MECHANISMS = _library()
 
 
 def mechanism(name: str) -> Mechanism:

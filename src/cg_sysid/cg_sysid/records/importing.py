@@ -126,7 +126,7 @@ SCHEMA = Mapping({
     'title': Key(Text(), default=''),
     'source': Key(Mapping({}, further=True), default={}),
     'files': Key(Patterns()),
-    'mechanism': Key(Text(tuple(channels.MECHANISMS))),
+    'mechanism': Key(Text()),
     'start': Key(Start(), default='1970-01-01T00:00:00+00:00'),
     'time': Key(Mapping({
         'column': Key(Text(), default=''),
@@ -206,7 +206,10 @@ def load_mapping(name: str | Path) -> dict[str, Any]:
     mapping = SCHEMA.of(tree, where, RecordingError)
     if not {'column', 'rate_hz'} & set(mapping['time']):
         raise RecordingError(f'{where}: time: a column or rate_hz is needed')
-    known = channels.mechanism(mapping['mechanism'])
+    try:
+        known = channels.mechanism(mapping['mechanism'])
+    except ValueError as error:
+        raise RecordingError(f'{where}: mechanism: {error}') from None
     cases = [(f'cases[{k}].', case) for k, case in enumerate(mapping['cases'])]
     for at, part in [('', mapping), *cases]:
         for key in ('channels', 'commands'):

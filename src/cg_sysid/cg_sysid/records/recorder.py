@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cg_dynamics.rig import STANCES
 from cg_interfaces import topics
-from cg_interfaces.channels import MECHANISMS, STRING
+from cg_interfaces.channels import STRING, mechanism
 from cg_interfaces.settings import Settings, setting
 from cg_interfaces.topics import EXPERIMENT
 from cg_sysid.records.journal import Journal
@@ -40,7 +40,7 @@ class RecorderSettings(Settings):
     """Parameters of the recorder node."""
 
     bag: str = setting('', 'directory to write, which must not exist yet')
-    mechanism: str = setting('compass_gait', 'whose topics to record', choices=tuple(MECHANISMS))
+    mechanism: str = setting('compass_gait', 'whose topics to record')
     also: tuple[str, ...] = setting((), 'further topics, each as name:type')
     time: str = setting(
         'receipt',
@@ -71,7 +71,7 @@ def topics_to_record(settings: RecorderSettings) -> dict[str, str]:
         ValueError: A message type is unknown.
     """
     topics = {EXPERIMENT: STRING}
-    for topic in MECHANISMS[settings.mechanism].topics.values():
+    for topic in mechanism(settings.mechanism).topics.values():
         topics[topic.name] = topic.msgtype
     topics |= EXTRA_TOPICS.get(settings.mechanism, {})
     for entry in settings.also:
@@ -90,11 +90,11 @@ def needed_topics(settings: RecorderSettings) -> tuple[str, ...]:
 
 def expected_topics(settings: RecorderSettings) -> tuple[str, ...]:
     """Topics of which every sample counts: a recording begins when all of them have begun."""
-    mechanism = MECHANISMS[settings.mechanism]
-    topics = [mechanism.torque.name, *(topic.name for topic in mechanism.outputs)]
+    machine = mechanism(settings.mechanism)
+    topics = [machine.torque.name, *(topic.name for topic in machine.outputs)]
     topics += EXTRA_TOPICS.get(settings.mechanism, {})
     if settings.time == 'stamp':
-        topics.append(mechanism.command.name)
+        topics.append(machine.command.name)
     return tuple(topics)
 
 
