@@ -45,11 +45,7 @@ from cg_control.orbit import Orbit, plan_orbit
 from cg_control.preview import Preview
 from cg_control.surfaces import with_surfaces
 from cg_control.tracking import LEAST_TURN, WALKING, Tracker, TrackingSettings
-from cg_control.transverse import (
-    stabilise_over_phase,
-    stabilise_transversely,
-    with_own_surfaces,
-)
+from cg_control.transverse import stabilise_over_phase, stabilise_transversely, with_own_surfaces
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
 from cg_control.tvlqr import Weights, stabilise_periodically

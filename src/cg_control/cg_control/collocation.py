@@ -19,12 +19,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from cg_control.friction import (
-    compensated,
-    friction_parameters,
-    friction_torque,
-    known_beforehand,
-)
+from cg_control.friction import compensated, friction_parameters, friction_torque, known_beforehand
 from cg_control.program import GUESSES, SMALLEST_LIMIT, WEAK, Guess, Program, Solution
 from cg_control.task import Box, Goal, Stretch, Task
 from cg_control.trajectory import Phase, Trajectory

@@ -9,16 +9,7 @@ from small_growth import ROUND, assert_same, make_small
 
 from cg_control.checkpoint import Checkpoint
 from cg_control.extension import Extension, ExtensionOptions
-from cg_control.grow_tree import (
-    BOX,
-    GROWTH,
-    LANDING,
-    REGION,
-    Growing,
-    grow,
-    main,
-    upright_tree,
-)
+from cg_control.grow_tree import BOX, GROWTH, LANDING, REGION, Growing, grow, main, upright_tree
 from cg_control.growth import Counts, Grower, Region
 from cg_control.lookup import Lookup
 from cg_control.rollouts import Outcome, follow

@@ -5,17 +5,7 @@ import math
 import pytest
 
 from cg_description.reading import DocumentError
-from cg_description.schema import (
-    Anything,
-    Flag,
-    Key,
-    ListOf,
-    MapOf,
-    Mapping,
-    Number,
-    Text,
-    Whole,
-)
+from cg_description.schema import Anything, Flag, Key, ListOf, MapOf, Mapping, Number, Text, Whole
 
 POINT = Mapping({'x': Key(Number(0.0, 10.0)), 'y': Key(Number(), default=0.0)})
 FORM = Mapping({

@@ -15,12 +15,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from cg_dynamics.linearise import (
-    jacobians,
-    linearise,
-    without_dry_friction,
-    without_extra_states,
-)
+from cg_dynamics.linearise import jacobians, linearise, without_dry_friction, without_extra_states
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 from cg_dynamics.rollout.compiled import CompiledModel

@@ -220,7 +220,10 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
         ({'files': None}, 'files: is missing'),
         ({'files': '*.bin'}, 'no file matches'),
         ({'colour': 'red'}, "unknown entry 'colour'"),
-        ({'mechanism': 'cart_pole'}, "mechanism: unknown mechanism 'cart_pole'; known are compass_gait"),
+        (
+            {'mechanism': 'cart_pole'},
+            "mechanism: unknown mechanism 'cart_pole'; known are compass_gait",
+        ),
         ({'time': {'column': 'nope'}}, "no column 'nope'"),
         ({'time': {}}, 'time: a column or rate_hz is needed'),
         ({'start': 'yesterday'}, "start: 'yesterday' is no time; an ISO 8601 time"),

@@ -8,16 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from unlisted import (
-    CASES,
-    DURATION,
-    MORE,
-    SoftStop,
-    TiltedGyro,
-    ViscoelasticHip,
-    hide,
-    records,
-)
+from unlisted import CASES, DURATION, MORE, SoftStop, TiltedGyro, ViscoelasticHip, hide, records
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model

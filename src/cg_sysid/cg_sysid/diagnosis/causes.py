@@ -21,12 +21,8 @@ from cg_sysid.search.candidates import (
     parameters_of,
     shared_parameters,
 )
-from cg_sysid.search.model_selection import (
-    Comparison,
-)
-from cg_sysid.search.nuisance import (
-    nuisances,
-)
+from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.ranking import contains, effect_name
 
 log = logging.getLogger(__name__)
@@ -133,7 +129,7 @@ def _idle(o: Outcome, label: str, other: str) -> bool:
 
 
 def cause_among(final: Outcome, label: str, comparisons: Sequence[Comparison]) -> Cause:
-    """The cause, judged by the contest that had the most beside it."""
+    """The cause, judged by the comparison that had the most beside it."""
     known = [c for c in comparisons if (own := c.of(label)) and not own[0].reason]
     if not known:
         return as_in(final, Cause(label, parameters_of(final, label), float('inf')))

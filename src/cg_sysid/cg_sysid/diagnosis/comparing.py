@@ -7,13 +7,8 @@ import numpy as np
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
-from cg_sysid.search.model_selection import (
-    Comparison,
-    settled,
-)
-from cg_sysid.search.nuisance import (
-    nuisances,
-)
+from cg_sysid.search.model_selection import Comparison, settled
+from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.successive_halving import Effects
 
 

@@ -33,9 +33,7 @@ from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
-    Task,
-)
+from cg_sysid.search.candidates import Task
 from cg_sysid.search.standings import Unfinished
 from cg_sysid.stances.held_foot import held_by_friction
 from cg_sysid.stances.phases import Landing, cut_steps

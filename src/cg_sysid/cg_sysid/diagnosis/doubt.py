@@ -5,17 +5,9 @@ from dataclasses import replace
 
 from cg_sysid.diagnosis.comparing import compare
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import (
-    Outcome,
-    Task,
-    chi2,
-)
-from cg_sysid.search.model_selection import (
-    Comparison,
-)
-from cg_sysid.search.nuisance import (
-    with_nuisances,
-)
+from cg_sysid.search.candidates import Outcome, Task, chi2
+from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.nuisance import with_nuisances
 from cg_sysid.search.ranking import contains
 
 log = logging.getLogger(__name__)

@@ -6,16 +6,9 @@ from cg_sysid.diagnosis.comparing import done
 from cg_sysid.diagnosis.conclude import answer, verdict_of
 from cg_sysid.diagnosis.result import Diagnosis, Verdict
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import (
-    Outcome,
-    candidates_for,
-)
-from cg_sysid.search.model_selection import (
-    share_explained,
-)
-from cg_sysid.search.nuisance import (
-    nuisances,
-)
+from cg_sysid.search.candidates import Outcome, candidates_for
+from cg_sysid.search.model_selection import share_explained
+from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import Unfinished
 
 

@@ -3,12 +3,8 @@
 from cg_sysid.diagnosis.comparing import compare, done, refitted
 from cg_sysid.diagnosis.small_faults import bare, of_size, rather_one_cause, with_small_faults
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import (
-    Outcome,
-)
-from cg_sysid.search.model_selection import (
-    settled,
-)
+from cg_sysid.search.candidates import Outcome
+from cg_sysid.search.model_selection import settled
 
 
 def extend(work: Workspace, o: Outcome) -> Outcome:

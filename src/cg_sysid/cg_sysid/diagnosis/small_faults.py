@@ -7,13 +7,7 @@ from dataclasses import replace
 from cg_sysid.diagnosis.comparing import compare, refitted
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
-    Outcome,
-    Task,
-    chi2,
-    parameters_of,
-    started_from,
-)
+from cg_sysid.search.candidates import Outcome, Task, chi2, parameters_of, started_from
 from cg_sysid.search.model_selection import (
     Comparison,
     above_noise,
@@ -21,12 +15,7 @@ from cg_sysid.search.model_selection import (
     explained_by,
     settled,
 )
-from cg_sysid.search.nuisance import (
-    as_sound_robots,
-    faults_among,
-    nuisances,
-    with_nuisances,
-)
+from cg_sysid.search.nuisance import as_sound_robots, faults_among, nuisances, with_nuisances
 from cg_sysid.search.ranking import Candidate
 from cg_sysid.text import measured
 

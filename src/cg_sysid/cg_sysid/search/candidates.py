@@ -39,7 +39,7 @@ class Task:
         thorough: Fit whole records down to the very bottom (identify.fit).
         base: Fit of the base. With an effect more it can only be better; where a fit from the
             file's numbers is not, it goes on from there.
-        first: Fit of the base to a glimpse of the records, for looks in the same way.
+        first: Fit of the base to an excerpt of the records, for looks in the same way.
         reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
     """
 
@@ -57,7 +57,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Screening:
-    """A fit to a glimpse of the records: is a candidate worth a whole one?
+    """A fit to an excerpt of the records: is a candidate worth a whole one?
 
     Attributes:
         label: Label of the effect.
@@ -134,7 +134,7 @@ def starts_of(name: str) -> list[dict[str, float]]:
 
 
 def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
-    """Fit one candidate to a glimpse of the training data sets, from each of its starts.
+    """Fit one candidate to an excerpt of the training data sets, from each of its starts.
 
     Returns:
         The look, or a sentence saying why there is none.
@@ -362,7 +362,7 @@ def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
 
 
 def _chosen(model: Model, warm_start: Fit) -> Model:
-    """The model with the choices that a lead has made for the last of its effects."""
+    """The model with the choices that a warm start has made for the last of its effects."""
     stated = warm_start.model.values
     names = [f'{e.label}.{p.name}' for e in model.effects[-1:] for p in e.parameters if p.choice]
     return model.with_values({name: stated[name] for name in names if name in stated})
@@ -387,9 +387,9 @@ def eventful(task: Task) -> bool:
 
 
 def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
-    """Fits to a glimpse from every start: the best, and others that differ from it.
+    """Fits to an excerpt from every start: the best, and others that differ from it.
 
-    From the task's leads, where it has some: looks at the same beside other small faults.
+    From the warm starts of the task, where it has some: screenings of the same beside other small faults.
     """
     models = list(_starting_models(task))
     starts: list[Start] = [(model, None) for model in models]
@@ -462,7 +462,7 @@ def _screened(
     start: Fit | None = None,
     length: float | None = None,
 ) -> Fit:
-    """A fit to a glimpse of the records: as long as the base's own look, if there is one."""
+    """A fit to an excerpt of the records: as long as the base's own look, if there is one."""
     few = [train[i] for i in excerpt.few(train)]
     return fit(
         model, few, only,
@@ -473,7 +473,7 @@ def _screened(
 
 
 def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
-    """Fit of a task's base to a glimpse, from its fit to whole records; None without.
+    """Fit of a task's base to an excerpt, from its fit to whole records; None without.
 
     To so many seconds that something is wrong there: where nothing is, nothing can help.
     """
@@ -490,7 +490,7 @@ def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
 
 
 def deeper(task: Task, warm_start: Fit, train: Sequence[DataSet]) -> Fit | None:
-    """Fit of a task's base to a glimpse from where an effect more has led its numbers.
+    """Fit of a task's base to an excerpt from where an effect more has led its numbers.
 
     Returns:
         The fit, if it lies clearly deeper than the base's own; None otherwise.

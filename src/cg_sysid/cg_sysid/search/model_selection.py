@@ -59,7 +59,7 @@ class Comparison:
         return simpler[0] if simpler else able[0]
 
     def less(self, label: str, reason: str) -> 'Comparison':
-        """The contest with the candidate of that label turned down after all."""
+        """The comparison with the candidate of that label turned down after all."""
         return replace(self, ranked=tuple(
             (replace(c, reason=reason) if c.label == label else c, o) for c, o in self.ranked
         ))  # fmt: skip

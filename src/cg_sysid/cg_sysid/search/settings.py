@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Screening:
-    """First looks at candidates, on an excerpt of the records: diagnosis.md, "A race".
+    """First looks at candidates, on an excerpt of the records: diagnosis.md, section 4.
 
     Attributes:
         lengths_s: Lengths of the excerpt of long records in s: the first of them in which the base

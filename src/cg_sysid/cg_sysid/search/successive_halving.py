@@ -1,10 +1,13 @@
-"""The race of all candidates on top of one model: who is fitted, in what order, and how far.
+"""Successive halving: who is fitted on top of one model, in what order, and how far.
 
-    first look (glimpse.py), the light ones before the heavy
+    first look (excerpt.py), the light ones before the heavy
       -> those that look best are fitted to whole records, then all others within reach
       -> ever longer fits of those that may still win
 
-What one comes to is what the next are measured by: a fit out of reach that gains little is broken
+Rungs of ever more iterations, after each of which only those go on that may still win, are
+successive halving (Jamieson and Talwalkar, "Non-stochastic best arm identification and
+hyperparameter optimization", AISTATS 2016), with a rule of reach in place of a half. What one
+comes to is what the next are measured by: a fit out of reach that gains little is broken
 off, so that a library of effects costs little more than those of them that matter.
 """
 
@@ -104,7 +107,7 @@ class SuccessiveHalving:
             effects: Effects and places.
             what: For the progress.
             beaten: chi2/N that is to be beaten, or nearly so.
-            earned: chi2/N that has to be come to (Jury.to_be_earned).
+            earned: chi2/N that has to be come to (ModelSelection.to_be_earned).
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
