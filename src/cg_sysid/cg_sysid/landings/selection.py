@@ -1,9 +1,9 @@
 """Landings judged: is the impact plastic, does the foot bounce, does it slide?
 
 Only after the causes within the phases are known: what a payload does to an impact is no bounce.
-The rules are those of the phases (search/model_selection.py): evidence, a significant gain on landings held out, an
-error that is more than noise; and the law has to explain most of it, as a wrong mass can pass for
-a little of either.
+The rules are those of the phases (search/model_selection.py): evidence, a significant gain on
+landings held out, an error that is more than noise. And the law has to explain most of it, as a
+wrong mass can pass for a little of either.
 """
 
 from collections.abc import Callable, Sequence

@@ -389,7 +389,8 @@ def eventful(task: Task) -> bool:
 def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
     """Fits to an excerpt from every start: the best, and others that differ from it.
 
-    From the warm starts of the task, where it has some: screenings of the same beside other small faults.
+    From the warm starts of the task, where it has some: screenings of the same effect beside
+    other small faults.
     """
     models = list(_starting_models(task))
     starts: list[Start] = [(model, None) for model in models]
