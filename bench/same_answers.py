@@ -32,6 +32,7 @@ EFFECTS = {
     'pair': (('torque_bias', 'encoder_scale'), False),
 }
 SECONDS = 6.0
+LONG, FEW = ('unlisted', 'walk'), 'torque_constant,payload,torque_bias,foot_slip'  # minutes else
 RENAMED: dict[str, str] = {}  # field of an older diagnosis.json -> today's name
 OF_THE_RUN = {'provenance', 'seconds', 'evaluations', 'made', 'created', 'elapsed', 'version'}
 
@@ -91,7 +92,8 @@ def answer(folder: Path, name: str, checkout: Path) -> None:
         bags = sorted(str(p) for p in place.iterdir() if p.is_dir())
         model = 'sydney_pendulum' if place.name == 'real' else 'compass_gait_mit'
         command = [str(checkout / 'cg'), 'diagnose', '--model', model, '--out', str(out),
-                   '--workers', '1', '--budget', 'inf', '--quiet', *bags]  # fmt: skip
+                   '--workers', '1', '--budget', 'inf', '--quiet',
+                   *(['--effects', FEW] if place.name in LONG else []), *bags]  # fmt: skip
         wall, used = time.monotonic(), _cpu()
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         took = {'wall': time.monotonic() - wall, 'cpu': _cpu() - used, 'exit': done.returncode}
