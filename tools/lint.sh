@@ -5,5 +5,6 @@ cd "$(dirname "$0")/.."
 . tools/env.sh || exit 1
 status=0
 ruff check . || status=1
+ruff format --check . || status=1
 mypy src/*/cg_* || status=1
 exit $status
