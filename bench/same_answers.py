@@ -135,7 +135,7 @@ def compare(folder: Path, first: str, second: str, write: Path | None) -> int:
                      f'| {times[0]:.1f} | {times[1] / times[0]:.2f} |')  # fmt: skip
         print(lines[-1], flush=True)
         for where, was, is_ in found[1:12]:
-            print('   ', where, was, is_)
+            print('   ', where, str(was)[:60], str(is_)[:60])
     if write:
         write.write_text('\n'.join([
             '# The same answers', '',
