@@ -31,6 +31,8 @@ from cg_sysid.search.standings import Unfinished
 
 log = logging.getLogger(__name__)
 
+TURNS = 3  # periods that a term of a short stretch of an angle is tried with
+
 
 def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     """The answer when nothing more is earned: look-alikes, causes, last fits, verdict."""
@@ -67,26 +69,42 @@ def relative(work: Workspace, nominal: Outcome, term: Unmodelled | None) -> Outc
 
     How often a turn something repeats has many local minima; a learned term knows it.
     """
-    if term is None or term.period is None:
+    if term is None:
         return None
-    period, size = term.period[0], float(np.ptp(term.shape.value) / 2)
+    if term.period is not None:
+        periods = [term.period[0]]
+    elif term.effect.variable == 'angle' and not term.effect.slides(work.nominal.mechanism):
+        periods = term.shape.turns(TURNS)
+    else:
+        return None
+    size = float(np.ptp(term.shape.value) / 2)
     tasks = []
     for name, kind in LIBRARY.items():
         if kind.family != term.effect.family:
             continue
         at = kind(work.nominal.mechanism, term.effect.site).at
-        for values in kind.repeating(period, size):
+        for values in (v for period in periods for v in kind.repeating(period, size)):
             model = nominal.task.model.with_effect(name, at, **values)
             known = replace(term.fit, motions=nominal.train.motions, own=nominal.train.own)
             start = started_from(known, model, nominal.task.bounds)
-            tasks.append(Task(model, bounds=nominal.task.bounds, warm_starts=(start,)))
-    found = work.halving.fit(tasks, f'{term.label}, as effects of the library')
-    outcomes = [
-        replace(o, label=o.model.effects[-1].label) for o in found if isinstance(o, Outcome)
-    ]
-    if not outcomes:
+            tasks.append(
+                Task(
+                    model,
+                    bounds=nominal.task.bounds,
+                    warm_starts=(start,),
+                    iterations=settings.HALVING.rungs[0],
+                )
+            )
+    title = f'{term.label}, as effects of the library'
+    first = [o for o in work.halving.fit(tasks, title) if isinstance(o, Outcome)]
+    if not first:
         return None
-    comparison = work.selection.compare(nominal, [min(outcomes, key=chi2)])
+    best = min(first, key=chi2)
+    task = replace(best.task, warm_starts=(best.train,), iterations=settings.FITTING.iterations)
+    found = [o for o in work.halving.fit([task], title) if isinstance(o, Outcome)]
+    best = min([best, *found], key=chi2)
+    best = replace(best, label=best.model.effects[-1].label)
+    comparison = work.selection.compare(nominal, [best])
     winner = comparison.winner()
     if winner is None or share_explained(nominal.held, winner[1].held) < settings.DOUBT.nearly_all:
         return None

@@ -5,6 +5,7 @@ Its standard deviation follows from that of the coefficients,
     var g(s) = (dg/dc) C (dg/dc)'                                                     (BAND)
 """
 
+import math
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -13,6 +14,7 @@ import numpy as np
 from cg_dynamics.effects.unmodelled import LearnedEffect
 from cg_sysid.identification.identify import Fit
 
+MOST_TURNS = 16  # waves in a turn that a short stretch of it is tried with
 GRID = 121
 ENDS = 0.005  # share of the samples at either end of the range that does not count as covered
 RARE = 0.1  # share of an even spread of the samples from which a place of the grid counts as seen
@@ -52,6 +54,21 @@ class Shape:
     peak: float
     even: float | None
     stretch: tuple[float, float] | None
+
+    def turns(self, count: int) -> list[float]:
+        """Periods in rad of the waves that fit the function best, whole numbers in a turn.
+
+        For a function of an angle that covers too little of it to be learned as one that repeats,
+        but a whole period at least: less is a shape, and any wave resembles it.
+        """
+        s, g = self.s[self.seen], self.value[self.seen]
+        left = []
+        low, high = self.covered
+        for cycles in range(math.ceil(2 * math.pi / (high - low)), MOST_TURNS + 1):
+            waves = np.column_stack([np.ones_like(s), np.cos(cycles * s), np.sin(cycles * s)])
+            found = np.linalg.lstsq(waves, g, rcond=None)[0]
+            left.append((float(((g - waves @ found) ** 2).sum()), cycles))
+        return [2 * np.pi / cycles for _, cycles in sorted(left)[:count]]
 
     @property
     def constant(self) -> bool:
