@@ -11,6 +11,7 @@ from cg_dynamics.model import Model
 from cg_sysid import rehearse, write_bag
 from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.search import settings
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([*(ROOT / 'docs').glob('*.md'), ROOT / 'README.md', ROOT / 'CONTRIBUTING.md'])
@@ -63,6 +64,16 @@ def test_links_lead_somewhere(page):
         assert target.exists(), f'{page.name}: {link}'
         if anchor and target.suffix == '.md':
             assert anchor in _anchors(target), f'{page.name}: {link}'
+
+
+def test_thresholds_that_the_docs_state_are_those_of_the_search():
+    text = (ROOT / 'docs' / 'diagnosis.md').read_text('utf-8')
+    stated = re.findall(r'`([a-z]+)\.(\w+)` ([\d.]+)', text)
+    assert len(stated) > 15
+    for stage, name, value in stated:
+        found = getattr(getattr(settings, stage.upper()), name)
+        first = found[0] if isinstance(found, tuple) else found
+        assert first == pytest.approx(float(value)), f'{stage}.{name}'
 
 
 def test_the_public_face_is_what_the_docs_list():
