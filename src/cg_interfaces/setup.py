@@ -1,15 +1,6 @@
-from glob import glob
-from pathlib import Path
-
 from setuptools import find_packages, setup
 
 NAME = 'cg_interfaces'
-
-
-def shared(*folders):
-    """The files below these folders, each to its place under share/cg_interfaces."""
-    files = [p for folder in folders for p in sorted(glob(f'{folder}/**', recursive=True))]
-    return [(f'share/{NAME}/{Path(p).parent}', [p]) for p in files if Path(p).is_file()]
 
 
 setup(

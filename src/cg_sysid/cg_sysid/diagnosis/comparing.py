@@ -9,6 +9,7 @@ from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
 
 
@@ -23,7 +24,7 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
             base.model, work.setups(), work.options.effects, recorded,
             nuisances(base.model, bounds),
         )  # fmt: skip
-        title = f'effects on top of {work.title(added)}'
+        title = f'effects on top of {title_of(added)}'
         work.under_way = base
         base, task = led_deeper(work, base, effects, title)
         work.under_way = base
@@ -50,7 +51,7 @@ def led_deeper(
         if warm_start is None:
             break
         task = replace(task_alone, warm_starts=(warm_start,), base=None)
-        deeper = work.halving.fit([task], f'{work.title(work.added(base))}, deeper')[0]
+        deeper = work.halving.fit([task], f'{title_of(work.added(base))}, deeper')[0]
         if isinstance(deeper, str) or settings.SCREENING.same * chi2(deeper) > chi2(base):
             break
         work.halving.forget(task_alone)

@@ -17,6 +17,7 @@ from cg_sysid.search.model_selection import (
 )
 from cg_sysid.search.nuisance import as_sound_robots, faults_among, nuisances, with_nuisances
 from cg_sysid.search.ranking import Candidate
+from cg_sysid.search.standings import title_of
 from cg_sysid.text import measured
 
 log = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     if settled(o) or o.task.bounds:
         return o
     model, bounds = with_nuisances(o.model, work.setups())
-    title = f'{work.title(work.added(o))}, with small faults'
+    title = f'{title_of(work.added(o))}, with small faults'
     found = work.halving.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
     if isinstance(found, str):
         log.info('small faults: %s', found)

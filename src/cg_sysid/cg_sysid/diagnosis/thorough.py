@@ -10,6 +10,7 @@ from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, fit_to_all, one_minimum
 from cg_sysid.search.model_selection import Comparison, at_noise
 from cg_sysid.search.ranking import contains
+from cg_sysid.search.standings import title_of
 
 
 def thorough(work: Workspace, o: Outcome) -> Outcome:
@@ -28,7 +29,7 @@ def fitted_thoroughly(work: Workspace, o: Outcome) -> Outcome:
     task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                 iterations=settings.FITTING.thorough_iterations)  # fmt: skip
     tasks = [replace(task, warm_starts=(start.train,)) for start in (o, *other_minima(work, o))]
-    title = f'thorough fits of {work.title(work.added(o))}'
+    title = f'thorough fits of {title_of(work.added(o))}'
     found = [fitted for fitted in work.halving.fit(tasks, title) if isinstance(fitted, Outcome)]
     return min([o, *found], key=chi2)
 
@@ -43,7 +44,7 @@ def other_minima(work: Workspace, o: Outcome) -> list[Outcome]:
         Task(o.model.without_effect(e.label), (e.name, e.at), o.events, o.task.bounds)
         for e in effects
     ]
-    title = f'other starts of {work.title(work.added(o))}'
+    title = f'other starts of {title_of(work.added(o))}'
     near = settings.SCREENING.same * o.train.normalised_error
     tasks = [
         replace(
@@ -85,7 +86,7 @@ def fitted_to_all(work: Workspace, o: Outcome) -> Fit | str:
     """A thorough fit of an outcome's structure to all records, or why there is none."""
     key = structure(o)
     if key not in work.joint:
-        title = f'{work.title(work.added(o))} on all records'
+        title = f'{title_of(work.added(o))} on all records'
         found = work.carry_out(fit_to_all, [(o, (*work.train, *work.held))], title)[0]
         work.joint[key] = found
     return work.joint[key]

@@ -103,14 +103,10 @@ class Workspace:
         self.so_far.note(result)
         return self.so_far.best
 
-    def title(self, added: frozenset[str]) -> str:
-        """The nominal model and what was added, in words."""
-        return title_of(added)
-
     def note(self, comparison: Comparison, accepted: str) -> None:
         """Keep a comparison as a round of the answer, with what was accepted in it."""
         candidates = tuple(c for c, _ in comparison.ranked)
-        title = self.title(self.added(comparison.base))
+        title = title_of(self.added(comparison.base))
         self.rounds.append(
             Round(title, candidates, accepted, comparison.independent, comparison.aside)
         )
