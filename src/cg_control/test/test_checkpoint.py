@@ -247,7 +247,7 @@ def test_a_signal_ends_growth_with_a_checkpoint(robot, in_one_go, tmp_path, numb
     written_anew(part, b'', process)
     os.killpg(process.pid, number)  # as a terminal does it: to those that plan, too
     said, err = process.communicate(timeout=LONG)
-    assert (process.returncode, said) == (128 + number, '')
+    assert (process.returncode, said) == (128 + number, ''), err
     assert err.splitlines()[-1] == (
         f'grow_tree: stopped by {number.name}; the tree so far is in {part}, and the same command '
         'goes on from there'

@@ -44,8 +44,9 @@ class Parameter:
             one.
         smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn
             it faster; a solver may start with a wider one.
-        bounded: True of a share, whose range ends where physics does: a value there is a finding
-            as any other.
+        ends: The ends of its range, 'lower', 'upper' or both, at which physics ends as well: a
+            share that is none or all, a pulse too short for its shape to matter. A value there is
+            a finding as any other.
     """
 
     name: str
@@ -63,7 +64,7 @@ class Parameter:
     leeway: float = 0.0
     along: str = ''
     smoothing: bool = False
-    bounded: bool = False
+    ends: tuple[str, ...] = ()
 
     def sliding(self) -> 'Parameter':
         """This declaration for a joint that slides."""

@@ -48,14 +48,24 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """In this context a signal raises Stopped, so that what the process holds is given back."""
+    """In this context a signal raises Stopped, so that what the process holds is given back.
+
+    A signal may come inside a lock's own code, or in C that turns it into another error. Whatever
+    ends the context after a signal is told as the signal.
+    """
+    came: list[int] = []
 
     def on_signal(number: int, frame: Any) -> None:
+        came.append(number)
         raise Stopped(number)
 
     before = {number: signal.signal(number, on_signal) for number in _heard()}
     try:
         yield
+    except Exception as error:
+        if came:
+            raise Stopped(came[0]) from error
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -142,6 +142,22 @@ def test_nohup_is_respected():
     assert not stop.requested
 
 
+def test_a_signal_stays_one_where_it_breaks_what_it_comes_into():
+    """As the code of a lock does, or C that calls back."""
+
+    def wait():
+        with stopped_by_signals():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            except Stopped:
+                raise RuntimeError('release unlocked lock') from None
+
+    with pytest.raises(Stopped, match='SIGTERM'):
+        wait()
+    with pytest.raises(RuntimeError, match='of its own'), stopped_by_signals():
+        raise RuntimeError('of its own')
+
+
 def test_a_signal_can_be_an_exception():
     def wait():
         with stopped_by_signals():

@@ -4,11 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from unlisted import SETUPS
 
+from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_interfaces.channels import mechanism
 from cg_sysid.checks.recordings import check_recording
+from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.late_samples import late_samples
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
+from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 from cg_sysid.identification.data_set import DataSet
 
@@ -93,3 +99,29 @@ def test_an_unexplained_error_is_told_what_timing_makes_of_it():
     assert 'by 0.41 ms RMS' in said(SIGMA)
     assert 'of error in elbow_angle' in said(SIGMA)
     assert said(0.0) == ''
+
+
+def test_a_small_error_of_timing_is_no_consistency(model_file):
+    """Less than twice the noise, which other errors are forgiven."""
+    nominal, records = Model.load(model_file), []
+    for k in range(4):
+        setup, start = SETUPS[k % len(SETUPS)]
+        settings = ExcitationSettings(
+            amplitude=6.0, f_min=0.1, f_max=2.5, duration=6.0, seed=80 + k
+        )
+        signal, rng = make_signal(settings), np.random.default_rng(80 + k)
+        record = rehearse(f'record_{k}', nominal, setup, start, [signal], 6.0, 1 / RATE, 80 + k)
+        off = rng.normal(0.0, SIGMA, len(record.stamp_ns))
+        # To first order a sample that is late by `off` is rate times off further.
+        records.append(replace(record, outputs={
+            name: values + off * np.gradient(_smooth(values), 1 / RATE)
+            for name, values in record.outputs.items()
+        }))  # fmt: skip
+    options = Options(effects=('torque_constant', 'imu_offset'), workers=1)
+    answer = diagnose(nominal, records, options)
+    assert (answer.verdict, answer.causes) == ('unexplained', ())
+    assert 'beside their stamps, by 0.' in answer.summary
+
+
+def _smooth(values):
+    return np.convolve(np.pad(values, 4, mode='edge'), np.ones(9) / 9, mode='valid')

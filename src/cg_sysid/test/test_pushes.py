@@ -92,3 +92,29 @@ def test_pushes_of_other_shapes_are_found_one_by_one(model_file, shape, width):
     assert np.sum(np.abs(off) > SURELY) <= 1, off
     # And they are no wider than they need be.
     assert np.median(np.abs(off)) > 0.1, off
+
+
+def test_a_push_in_a_record_held_out_and_in_no_other(model_file):
+    """Beside a cause that explains all the others."""
+    nominal = Model.load(model_file)
+    impulse, middle = 2.7, 1.81
+    pushed = hide(nominal, pulse_of('half_sine', 0.12, impulse, middle))
+    records = []
+    for k in range(6):
+        machine = pushed if k == 3 else nominal.with_values(pushed.values)
+        machine = machine.with_effect('torque_dead_zone', half_width=0.7)
+        setup, start = SETUPS[k % len(SETUPS)]
+        settings = ExcitationSettings(
+            amplitude=6.0, f_min=0.1, f_max=2.5, duration=DURATION, seed=60 + k
+        )
+        records.append(rehearse(f'record_{k}', machine, setup, start, [make_signal(settings)],
+                                DURATION, SAMPLE, 60 + k))  # fmt: skip
+    effects = ('external_push', 'torque_dead_zone', 'encoder_zero', 'torque_constant')
+    answer = diagnose(nominal, records, Options(effects=effects, workers=1))
+    assert 'record_3' in {data_set.name for data_set in answer.held}
+    found = {cause.label: cause for cause in answer.causes}
+    assert set(found) == {'external_push', 'torque_dead_zone'}, answer.summary
+    ((name, event),) = found['external_push'].events.items()
+    assert name == 'record_3'
+    value, sigma, _ = event['impulse']
+    assert value == pytest.approx(impulse, abs=max(3 * sigma, 0.01 * impulse))

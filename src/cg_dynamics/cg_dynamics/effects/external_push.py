@@ -41,7 +41,7 @@ class ExternalPush(StanceEffect):
         ),
         Parameter(
             'duration', 's', 'standard deviation of the pulse in time', 0.002, 2.0,
-            starts=(0.1,), scale=0.02, logarithmic=True,
+            starts=(0.1,), scale=0.02, logarithmic=True, ends=('lower',),
         ),
         Parameter(
             'roundness', '1', 'share of the squared duration that is in the edges', 0.1, 0.9,

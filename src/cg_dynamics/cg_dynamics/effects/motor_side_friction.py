@@ -25,7 +25,7 @@ class MotorSideFriction(JointFlexibility):
         *JointFlexibility.parameters,
         Parameter(
             'share', '1', "of the joint's friction that acts on the rotor", 0.0, 1.0,
-            starts=(0.5,), scale=0.1, bounded=True,
+            starts=(0.5,), scale=0.1, ends=('lower', 'upper'),
         ),
     )  # fmt: skip
 

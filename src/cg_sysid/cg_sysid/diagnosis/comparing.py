@@ -32,8 +32,9 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
         aside: list[str] = []
         if not done(work, base):
             outcomes, aside = work.halving.run(
-                task, effects, title, beaten, work.selection.to_be_earned(base)
-            )
+                task, effects, title, beaten, work.selection.to_be_earned(base),
+                base.held.normalised_error,
+            )  # fmt: skip
         comparison = work.selection.compare(base, outcomes)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]

@@ -56,11 +56,11 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
         wandering = None  # the same for all records, and more
     share = share_explained(nominal.held, final.held)
     verdict = verdict_of(causes, bool(left), share)
-    late = (
-        told_late_samples(work, gained(work, nominal, final))
-        if verdict == Verdict.UNEXPLAINED
-        else ''
-    )
+    late = ''
+    if verdict == Verdict.UNEXPLAINED or not (causes or at_noise(final)):
+        late = told_late_samples(work, gained(work, nominal, final))
+    if late:
+        verdict = Verdict.UNEXPLAINED
     return answer(work, nominal, final, causes, verdict, unmodelled, wandering, late)
 
 

@@ -61,7 +61,7 @@ def summary_of(
         text = (
             f'Something is missing that no effect {whose} explains: {biggest.channel} is '
             f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
-            f'{biggest.noise:.2g}. {known or NOTHING}'
+            f'{biggest.noise:.2g}. {known or late or NOTHING}'
         )
         if causes:
             text += (
@@ -69,7 +69,7 @@ def summary_of(
                 f'goes with {listed([described(c) for c in causes])}, which may only stand in '
                 'for what is missing.'
             )
-        return f'{text} {late}' if late else text
+        return f'{text} {late}' if known and late else text
     named = ', '.join(described(c) for c in causes)
     if verdict == Verdict.UNFINISHED:
         text = (

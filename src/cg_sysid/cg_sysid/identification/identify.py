@@ -583,8 +583,9 @@ def _warnings(fit: Fit, bounds: Collection[str]):
         unit = '' if u.unit == '1' else f' {u.unit}'
         span = u.upper - u.lower
         declared = fit.model.declarations[u.name]
-        meant = declared.bounded or value == declared.neutral
-        if min(value - u.lower, u.upper - value) <= 1e-6 * span and not meant:
+        inside = {'lower': value - u.lower, 'upper': u.upper - value}
+        at_edge = any(inside[end] <= 1e-6 * span for end in inside.keys() - declared.ends)
+        if at_edge and value != declared.neutral:
             yield f'{u.name} = {value:.4g}{unit} lies at the edge of its range'
         if not np.isfinite(sigma):
             yield f'{u.name} cannot be identified from these records'

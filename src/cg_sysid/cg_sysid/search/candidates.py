@@ -698,8 +698,8 @@ def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
 def at_edge(o: Outcome) -> list[str]:
     """A parameter at the edge of its range says that the effect is not what is meant.
 
-    But for a part of an effect that may well be absent: the edge is where it vanishes; and for a
-    share, which may be none or all.
+    But for a part of an effect that may well be absent: the edge is where it vanishes; and where
+    physics ends with the range.
     """
     found = []
     kind = LIBRARY.get(o.label.partition('@')[0])
@@ -708,9 +708,9 @@ def at_edge(o: Outcome) -> list[str]:
         if kind
         else set()
     )
-    shares = {f'{o.label}.{p.name}' for p in kind.parameters if p.bounded} if kind else set()
+    ends = {f'{o.label}.{p.name}': p.ends for p in kind.parameters} if kind else {}
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
-        if u.name in {*o.task.bounds, *shares} or not u.name.startswith(f'{o.label}.'):
+        if u.name in o.task.bounds or not u.name.startswith(f'{o.label}.'):
             continue
         low, high, at = (
             u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
@@ -720,7 +720,9 @@ def at_edge(o: Outcome) -> list[str]:
         margin = 1e-3 * (high - low)
         if not u.logarithmic:
             margin = min(margin, 0.1 * u.scale)
-        below = np.inf if u.name in optional else at - low
-        if min(below, high - at) < margin:
+        physical = ends.get(u.name, ())
+        below = low + margin if u.name not in optional and 'lower' not in physical else -np.inf
+        above = high - margin if 'upper' not in physical else np.inf
+        if not below < at < above:
             found.append(f'{u.name} = {measured(v, None, u.unit)} lies at the edge of its range')
     return found

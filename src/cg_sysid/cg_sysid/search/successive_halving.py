@@ -99,6 +99,7 @@ class SuccessiveHalving:
         what: str,
         beaten: float = np.inf,
         earned: float = np.inf,
+        judged: float = np.inf,
     ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
 
@@ -108,6 +109,7 @@ class SuccessiveHalving:
             what: For the progress.
             beaten: chi2/N that is to be beaten, or nearly so.
             earned: chi2/N that has to be come to (ModelSelection.to_be_earned).
+            judged: chi2/N of the base on records held out.
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
@@ -145,9 +147,12 @@ class SuccessiveHalving:
                 [replace(screening.task, reach=reach) for screening in heat], what
             )
         # To seek events in every record takes long: first what explains most of the error.
-        best = min(_best(found), beaten)
-        if base.base is None or best > max(
-            settings.NOISE.nothing_left, _error(base.base) / settings.HALVING.mostly
+        # In records held out, too: something may have happened there and in no other.
+        before = _error(base.base)
+        if beaten > _most_of(before) and not any(
+            o.train.normalised_error <= _most_of(before)
+            and o.held.normalised_error <= _most_of(judged)
+            for o in found.values()
         ):
             found |= self._fitted(events, f'{what}, events')
         found |= self._in_more_depth(found, base.base, beaten, earned, what)
@@ -287,6 +292,11 @@ def _reach(best: float) -> float:
     return (
         settings.HALVING.near if best < settings.NOISE.nothing_left else settings.HALVING.in_reach
     ) * best
+
+
+def _most_of(error: float) -> float:
+    """chi2/N down to which most of an error is explained."""
+    return max(settings.NOISE.nothing_left, error / settings.HALVING.mostly)
 
 
 def _favoured(best: float) -> float:
