@@ -426,9 +426,15 @@ def wrong_ones(rows: list[dict[str, Any]]) -> list[str]:
 def version_of_sources() -> str:
     """A hash of all sources that an answer depends on."""
     digest = hashlib.sha256()
+    packages = 'dynamics', 'interfaces', 'sysid'
     files = [
-        *ROOT.glob('src/cg_*/cg_*/**/*.py'),
-        *ROOT.glob('src/cg_*/cg_*/**/*.c'),
+        *(
+            f
+            for p in packages
+            for kind in ('py', 'c')
+            for f in ROOT.glob(f'src/cg_{p}/cg_{p}/**/*.{kind}')
+        ),
+        ROOT / 'src/cg_bringup/cg_bringup/hidden.py',
         *ROOT.glob('src/cg_description/models/*.yaml'),
         ROOT / 'bench/foreign_laws.py',
     ]
