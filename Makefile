@@ -1,11 +1,11 @@
-# make setup | build | demo | test | lint | clean
+# make setup | build | demo | test | lint | docs | clean
 #
 #   make demo EFFECT=torque_constant SEED=3     hide this effect in the simulated robot and find it
 #   make test PACKAGES="cg_sysid cg_dynamics"   only these packages
 #   make setup PYTHON=/usr/bin/python3.12       with this interpreter
 
 SHELL := /bin/bash
-.PHONY: setup build demo test lint lock clean distclean help
+.PHONY: setup build demo test lint docs lock clean distclean help
 .NOTPARALLEL:
 
 export PYTHON
@@ -30,6 +30,11 @@ test: setup
 lint:
 	@tools/setup.sh base build ros test
 	@tools/lint.sh
+
+docs:
+	@tools/setup.sh docs
+	@.venv/bin/mkdocs build --quiet --strict
+	@echo 'docs: build/site/index.html'
 
 lock:
 	@tools/lock.sh

@@ -155,7 +155,7 @@ def row(rig: Rig, variant: Variant, stance: str) -> str:
 def table(rig: Rig, name: str) -> Iterator[str]:
     yield f'# Ways to a velocity, in the balancing loop of {rig.robot.name}'
     yield ''
-    yield f'`python bench/balance.py {name}`; what follows from it: docs/balance.md.'
+    yield f'`python bench/balance.py {name}`; what follows from it: balance.md.'
     yield ''
     yield (
         '| velocities from | stance | balances from 0.02 rad | from how far, rad '

@@ -2,7 +2,7 @@
 
     ./cg exec python bench/check_real.py DATA_DIR [--plots DIR] [--write FILE]
 
-DATA_DIR holds the folders of docs/data.md. Every recording that can be imported is checked with
+DATA_DIR holds the folders of data.md. Every recording that can be imported is checked with
 its published model and without one. `uncut` is the file that its mapping cuts where the encoder
 was zeroed anew, whole: a fault that the check must find. A refusal has a row with what is behind
 it, as far as somebody looked, and a picture of the signal around it in the folder of `--plots`.

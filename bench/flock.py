@@ -2,7 +2,7 @@
 
 The robots move in vector C (flock.c), as those of `rollouts.py` do, with impacts located in time.
 Laws are numpy over all robots, so that any law can be compared: `Following` is (FOL) of
-docs/trajectories.md as `Tracker` has it, `Constrained` virtual constraints, `Passive` no torque.
+trajectories.md as `Tracker` has it, `Constrained` virtual constraints, `Passive` no torque.
 """
 
 import ctypes

@@ -2,7 +2,7 @@
 
     ./cg exec python bench/real_data.py DATA_DIR [--only NAME] [--budget SECONDS] [--write FILE]
 
-DATA_DIR holds the folders of docs/data.md. Each set is cut into records that the diagnosis may
+DATA_DIR holds the folders of data.md. Each set is cut into records that the diagnosis may
 use (it splits them into training and held-out by itself, to choose among effects) and records on
 which nothing is chosen or fitted but each record's start: those judge. Records are whole wherever
 the whole can be followed (cg_sysid/following.py).

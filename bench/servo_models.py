@@ -1,4 +1,4 @@
-"""The servo's published friction models M1 to M6 on the files that judge ours (docs/results.md).
+"""The servo's published friction models M1 to M6 on the files that judge ours (results.md).
 
     ./cg exec python bench/servo_models.py DATA_DIR
 

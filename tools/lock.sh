@@ -12,14 +12,14 @@ compile() {  # arguments of uv pip compile
 }
 
 compile ./*.in --output-file "$all"  # one resolution, so that the parts agree
-for part in base build ros test oracles cluster bench; do
+for part in base build ros test oracles cluster hardware bench docs; do
     compile --constraint "$all" "$part.in" --output-file "$part.txt" --upgrade
 done
 # Every line carries the environment that pyproject.toml fixes and tools/setup.sh checks: leave it out.
 machine="platform_machine == 'x86_64' and platform_python_implementation == 'CPython'"
 machine+=" and sys_platform == 'linux'"
 sed -i -e "s/ and $machine//" -e "s/ and python_full_version < '3.14'//" \
-    -e "s/ ; python_full_version < '3.14'//" ./{base,build,ros,test,oracles,cluster,bench}.txt
+    -e "s/ ; python_full_version < '3.14'//" ./{base,build,ros,test,oracles,cluster,hardware,bench,docs}.txt
 if grep -nE '://' ./*.txt; then
     echo 'an address got into a lock file' >&2
     exit 1

@@ -1,11 +1,11 @@
-"""Write docs/effects.md from the effect library: python tools/make_effects_doc.py."""
+"""Write docs/reference/effects.md from the effect library: python tools/make_effects_doc.py."""
 
 import math
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TARGET = ROOT / 'docs' / 'effects.md'
+TARGET = ROOT / 'docs/reference/effects.md'
 
 PLACES = {
     'command': 'between the torque that the drive reports and the motor',

@@ -1,10 +1,10 @@
-"""Write docs/model_file.md from schema and mechanisms: python tools/make_model_file_doc.py."""
+"""Write model_file.md from schema and mechanisms: python tools/make_model_file_doc.py."""
 
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TARGET = ROOT / 'docs' / 'model_file.md'
+TARGET = ROOT / 'docs/reference/model_file.md'
 
 INTRODUCTION = """\
 # The model file

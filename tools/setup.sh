@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Prepare .venv from the lock files, and do nothing when it is up to date.
 #
-#     tools/setup.sh [PART...]   parts: base build ros test oracles cluster (all of these by default), bench
+#     tools/setup.sh [PART...]   parts: base build ros test oracles cluster hardware (all of these by default), bench, docs
 #
 # PYTHON=/path/to/python3 selects the interpreter. In a shell with ROS 2 Jazzy sourced, that ROS is
 # used: .venv then sees the system's packages and the part 'ros' is left out.
@@ -64,11 +64,11 @@ if [[ $(cat .venv/.made_for 2>/dev/null) != "$made_for" ]]; then
 fi
 
 parts=("$@")
-[[ $# -gt 0 ]] || parts=(base build ros test oracles cluster)
+[[ $# -gt 0 ]] || parts=(base build ros test oracles cluster hardware)
 missing=()
 for part in "${parts[@]}"; do
     lock=requirements/$part.txt
-    [[ -f $lock ]] || fail "there is no part '$part'; parts are base build ros test oracles cluster bench."
+    [[ -f $lock ]] || fail "there is no part '$part'; parts are base build ros test oracles cluster hardware bench docs."
     [[ $part == ros && -n $ros ]] && continue
     [[ $part == oracles && $machine != 'Linux x86_64' ]] && continue
     cmp -s "$lock" ".venv/.installed_$part" || missing+=("$part")

@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Run every block of the README as it is printed, in order, from a fresh clone.
+"""Run every block of the README, or of a tutorial, as it is printed, in order, in a fresh clone.
 
     tools/try_readme.py                                    clones, sets up, builds, tests: hours
     tools/try_readme.py --without 'make demo' 'make test'  clones and builds only
     tools/try_readme.py --within FOLDER ...                in a folder that is built already
+    tools/try_readme.py --page docs/tutorials/pendulum.md  another page
 
 A block of Python becomes the file that the sentence before it names. At the end of a fresh clone
 the `pip install` of the README is tried in an environment of its own. Needs python3 and git only.
@@ -86,10 +87,7 @@ def try_pip(readme: str, folder: Path) -> None:
     place = folder / 'offline'
     venv.create(place, with_pip=True)
     before = {path.name for path in (place / 'bin').iterdir()}
-    named = PIP_INSTALL.search(readme)
-    if named is None:
-        sys.exit('try_readme: the README names no pip install')
-    arguments = named[1].split()
+    arguments = PIP_INSTALL.search(readme)[1].split()
     subprocess.run([place / 'bin' / 'python', '-m', 'pip', *arguments], cwd=folder, check=True)
     ours = sorted(
         path.name for path in (place / 'bin').iterdir()
@@ -107,8 +105,9 @@ def main() -> None:
     )
     parser.add_argument('--without', nargs='*', default=[], metavar='COMMAND', help='leave out')
     parser.add_argument('--within', type=Path, metavar='FOLDER', help='no clone: run there')
+    parser.add_argument('--page', type=Path, default='README.md', help='[%(default)s]')
     options = parser.parse_args()
-    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    readme = (ROOT / options.page).read_text(encoding='utf-8')
     with tempfile.TemporaryDirectory(prefix='cg_readme_') as directory:
         folder = options.within or Path(directory) / 'clone'
         if options.within is None:
@@ -117,7 +116,7 @@ def main() -> None:
                 subprocess.run(['make', 'build'], cwd=folder, check=True)
         for block in blocks(readme):
             carry_out(block._replace(text=without(block.text, options.without)), folder)
-        if options.within is None:
+        if options.within is None and PIP_INSTALL.search(readme):
             try_pip(readme, folder)
     print('try_readme: every block went through')
 

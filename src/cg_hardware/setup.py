@@ -27,6 +27,14 @@ setup(
     maintainer='Compass-gait maintainers',
     maintainer_email='maintainers@compass-gait.dev',
     license='Apache-2.0',
+    keywords=['ROS 2', 'legged robots', 'system identification', 'underactuated robotics'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Topic :: Scientific/Engineering',
+    ],
     packages=find_packages(exclude=['test', 'test.*']),
     package_data={'': ['*.c', '*.css', '*.html', '*.js', '*.yaml']},
     data_files=[

@@ -2,7 +2,7 @@
 
     machine -> estimator -> controller -> torque gate -> machine
 
-once per sample, as docs/interfaces.md ("Lock-step") says of the nodes. Benches and tests run this.
+once per sample, as interfaces.md ("Lock-step") says of the nodes. Benches and tests run this.
 """
 
 from collections.abc import Sequence

@@ -12,7 +12,7 @@ import pytest
 
 SRC = Path(__file__).resolve().parents[2]
 
-# docs/architecture.md.
+# architecture.md.
 MAY_IMPORT = {
     'cg_description': set(),
     'cg_dynamics': {'cg_description'},

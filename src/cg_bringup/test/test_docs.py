@@ -1,6 +1,8 @@
 """What the docs print runs, and what they point to is there."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,12 +16,12 @@ from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.search import settings
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = sorted([*(ROOT / 'docs').glob('*.md'), ROOT / 'README.md', ROOT / 'CONTRIBUTING.md'])
+PAGES = sorted([*(ROOT / 'docs').glob('**/*.md'), ROOT / 'README.md', ROOT / 'CONTRIBUTING.md'])
 NAMES = ('run_1', 'run_2', 'run_07')  # of the bags that the blocks read
 PYTHON = [
     pytest.param(block, id=f'{page.name}-{k}')
     for page in PAGES
-    if page.name != 'README.md'  # test_readme.py
+    if page.name not in ('README.md', 'pendulum.md')  # as files: test_readme.py, below
     for k, block in enumerate(re.findall(r'```python\n(.*?)```', page.read_text('utf-8'), re.S))
 ]
 
@@ -66,8 +68,34 @@ def test_links_lead_somewhere(page):
             assert anchor in _anchors(target), f'{page.name}: {link}'
 
 
+def test_api_page_lists_what_is_public():
+    found = re.findall(r'^::: [\w.]+\.(\w+)$', (ROOT / 'docs/reference/api.md').read_text(), re.M)
+    assert sorted(found) == sorted(getattr(cg_sysid, n).__name__ for n in cg_sysid.__all__)
+
+
+def test_every_page_has_a_place_on_the_site():
+    site = (ROOT / 'mkdocs.yml').read_text('utf-8')
+    for page in (ROOT / 'docs').glob('**/*.md'):
+        assert f'- {page.relative_to(ROOT / "docs").as_posix()}\n' in site, page
+
+
+@pytest.mark.slow
+def test_a_tutorial_runs_as_printed(tmp_path):
+    """The one from a CSV to a diagnosis: it needs no ROS."""
+    for name in ('cg', 'src'):
+        (tmp_path / name).symlink_to(ROOT / name)
+    done = subprocess.run(
+        [sys.executable, ROOT / 'tools/try_readme.py', '--within', tmp_path, '--page',
+         'docs/tutorials/pendulum.md'],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    said = ' '.join(done.stdout.split())
+    assert done.returncode == 0, f'{done.stdout}\n{done.stderr}'
+    assert 'The simulation lacks stribeck_friction (torque = 0.0199' in said
+
+
 def test_thresholds_that_the_docs_state_are_those_of_the_search():
-    text = (ROOT / 'docs' / 'diagnosis.md').read_text('utf-8')
+    text = (ROOT / 'docs/explanation/diagnosis.md').read_text('utf-8')
     stated = re.findall(r'`([a-z]+)\.(\w+)` ([\d.]+)', text)
     assert len(stated) > 15
     for stage, name, value in stated:
@@ -77,7 +105,7 @@ def test_thresholds_that_the_docs_state_are_those_of_the_search():
 
 
 def test_the_public_face_is_what_the_docs_list():
-    text = (ROOT / 'docs' / 'python.md').read_text('utf-8').partition('Places of earlier')[0]
+    text = (ROOT / 'docs/reference/python.md').read_text('utf-8').partition('Places of earlier')[0]
     for name in cg_sysid.__all__:
         assert getattr(cg_sysid, name) is not None
         assert re.search(rf'`{name}\b|\b{name}\b', text), name

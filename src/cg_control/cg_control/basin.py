@@ -1,4 +1,4 @@
-"""From where the balance controller catches the robot: sampled, docs/balance.md, "The basin".
+"""From where the balance controller catches the robot: sampled, balance.md, "The basin".
 
 Upright, a stance phase has one unstable, one stable and one oscillating mode. In the coordinates
 of these modes a state is

@@ -1,4 +1,4 @@
-"""What a tree that is not grown yet needs to grow on: docs/trees.md, "Interrupted growth".
+"""What a tree that is not grown yet needs to grow on: trees.md, "Interrupted growth".
 
 A round depends on the tree before it, on the seed and on its number, and on nothing else. So the
 tree, what came by its nodes, the counts and the number of rounds after a whole round are enough:
@@ -26,7 +26,7 @@ from cg_dynamics.stop_request import StopRequest
 FORMAT = 'cg_growth/1'
 SHARE = 0.05  # of the time that may be spent with writing
 LEVELS = ('home', 'failed')
-MOST = 1 << 53  # states or rounds
+MOST_STATES = 1 << 53  # states or rounds
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def _numbers(header: Mapping[str, Any]) -> tuple[Counts, int, dict[str, str]]:
     if not isinstance(counts, dict) or set(counts) != names:
         raise TreeError(f'counts must be {", ".join(sorted(names))}')
     for name, value in (*counts.items(), ('rounds', rounds)):
-        if type(value) is not int or not 0 <= value < MOST:
+        if type(value) is not int or not 0 <= value < MOST_STATES:
             raise TreeError(f'{name} must be a whole number, not negative')
     assert isinstance(rounds, int)
     if not isinstance(decided, dict) or not all(isinstance(v, str) for v in decided.values()):

@@ -1,4 +1,4 @@
-"""Motions from states that nobody claims onto a tree: docs/trees.md, "Extension".
+"""Motions from states that nobody claims onto a tree: trees.md, "Extension".
 
 For each state motions are tried in this order, and the first one found is taken:
 

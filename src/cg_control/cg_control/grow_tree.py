@@ -1,4 +1,4 @@
-"""Grow a tree to upright, or onto the orbits of one that walks: docs/trees.md, docs/walking.md.
+"""Grow a tree to upright, or onto the orbits of one that walks: trees.md, walking.md.
 
     python -m cg_control.grow_tree --goal either --samples 5000 --out tree.npz
     python -m cg_control.grow_tree --onto walk.npz --samples 4096 --out grown.npz

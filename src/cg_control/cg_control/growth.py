@@ -1,4 +1,4 @@
-"""Growing a tree by falsification: docs/trees.md, "Growth".
+"""Growing a tree by falsification: trees.md, "Growth".
 
     1. Draw a state. The tree claims it if it lies in the funnel of a node, rho >= cost.
     2. A claim is simulated, from the node at which the state is least deep. If the robot comes

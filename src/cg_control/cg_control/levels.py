@@ -1,4 +1,4 @@
-"""The levels of funnels, from simulated robots that came by: docs/trees.md, "Levels".
+"""The levels of funnels, from simulated robots that came by: trees.md, "Levels".
 
 A funnel holds what its node brings home. Its level rho is infinite until a robot that came by
 fails, and then the largest cost below which at most a share `tolerated` of those that came by

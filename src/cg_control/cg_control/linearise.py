@@ -1,4 +1,4 @@
-"""What a linear controller is designed on: docs/balance.md, "The design model".
+"""What a linear controller is designed on: balance.md, "The design model".
 
 A controller acts on the four coordinates and rates of a stance phase, so its design model has no
 others: a spring before a rotor, lags and delays are what the loop must tolerate. Dry friction has

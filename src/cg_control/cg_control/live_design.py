@@ -3,7 +3,7 @@
 Gains are there within a millisecond, in the thread that asks. The basin of new gains comes later,
 from a process that was there before (basin_sampler.py). Until then the one before holds, made
 smaller in proportion where the torque limit was lowered: how far a limited torque reaches is
-proportional to the limit (docs/balance.md, "The basin").
+proportional to the limit (balance.md, "The basin").
 """
 
 from collections.abc import Callable

@@ -2,7 +2,7 @@
 
     python -m cg_control.plan_walk --speeds 0.2 0.25 0.3 --step 0.3 --out walk.npz
 
-What the tree controller needs to walk: docs/walking.md. Planning takes some seconds a speed.
+What the tree controller needs to walk: walking.md. Planning takes some seconds a speed.
 """
 
 import argparse

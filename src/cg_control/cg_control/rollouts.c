@@ -9,7 +9,7 @@
    and the sizes NX, NU, NP, NL (states that the law looks at), CONSTANTS, NK (parameters of the
    known model), and LEAST_TURN of the law.
 
-   The law is (FOL) of docs/trajectories.md, the same as in tracking.py; events are those of
+   The law is (FOL) of trajectories.md, the same as in tracking.py; events are those of
    cg_dynamics/hybrid.py. Rollouts have clocks of their own: a lane that ends takes the next one
    of its leg from a queue, and one that lands goes to the queue of the other leg. */
 

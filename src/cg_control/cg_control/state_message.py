@@ -1,4 +1,4 @@
-"""What a /state message says, read by its fields: docs/interfaces.md. No ROS here."""
+"""What a /state message says, read by its fields: interfaces.md. No ROS here."""
 
 from typing import Any
 

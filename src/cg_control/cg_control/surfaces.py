@@ -1,4 +1,4 @@
-"""Transversal surfaces along a motion: docs/theory.md, "Transverse coordinates".
+"""Transversal surfaces along a motion: theory.md, "Transverse coordinates".
 
 Through each point x0(s) of a motion goes a plane n(s)'(x - x0(s)) = 0; the phase of a robot is
 the s whose plane holds its state, whatever the clock says. Where a foot lands or has just landed

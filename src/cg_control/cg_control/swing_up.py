@@ -4,7 +4,7 @@
 
 A joint without stops comes upright after any number of whole turns: they are *turns* of the
 state, and the cheapest of the motions that are found counts. T is free. (SWING) becomes a program
-by (HS) of docs/trajectories.md, compressed, and IPOPT solves it.
+by (HS) of trajectories.md, compressed, and IPOPT solves it.
 """
 
 from dataclasses import dataclass

@@ -10,7 +10,7 @@ if the robot lands earlier or later they belong to the wrong leg. The remedies d
     phase   as event, and s follows the robot: it runs faster or slower towards the point of the
             reference on whose transversal surface the robot is
 
-`event` and `phase` are one law, (FOL) of docs/trajectories.md, which is written twice: here for
+`event` and `phase` are one law, (FOL) of trajectories.md, which is written twice: here for
 one robot that lives, and in rollouts.c for thousands that are simulated.
 """
 

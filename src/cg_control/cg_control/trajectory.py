@@ -1,7 +1,7 @@
 """A planned motion: phases of one stance leg each, with feedback and cost to go, and its file.
 
 Between knots the state is the cubic Hermite interpolant of states and rates, and the torque is
-linear: what direct collocation means by them (docs/trajectories.md, (HS)). Gains and cost to go
+linear: what direct collocation means by them (trajectories.md, (HS)). Gains and cost to go
 are linear in between. A file is JSON: every number is written with as many digits as bring it
 back exactly, and the hash of the model says for which robot it was planned.
 """

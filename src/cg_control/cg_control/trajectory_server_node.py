@@ -138,7 +138,7 @@ class TrajectoryServerNode(Node):
 
 
 def joint_trajectory(trajectory: Trajectory) -> JointTrajectory:
-    """The nominal motion: docs/interfaces.md, "Trajectories"."""
+    """The nominal motion: interfaces.md, "Trajectories"."""
     message = JointTrajectory(joint_names=list(STANCES))
     message.header.frame_id = f'{trajectory.modes[0]}_foot'
     start = trajectory.phases[0].start

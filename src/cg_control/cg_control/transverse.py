@@ -1,4 +1,4 @@
-"""Transverse linear-quadratic regulation: docs/theory.md, "Transverse coordinates".
+"""Transverse linear-quadratic regulation: theory.md, "Transverse coordinates".
 
 A state on the surface of phase s is x = x0(s) + E(s) z, with E the frame of the surface and z its
 three coordinates. Exactly, and to first order in z and the torque v = u - u0(s),

@@ -138,7 +138,7 @@ class TreeServerNode(Node):
 
 
 def joint_trajectory(way: WayHome | None) -> JointTrajectory:
-    """The way home: docs/interfaces.md, "Trajectories"."""
+    """The way home: interfaces.md, "Trajectories"."""
     message = JointTrajectory(joint_names=list(STANCES))
     if way is None:
         return message

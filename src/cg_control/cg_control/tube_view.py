@@ -16,7 +16,7 @@ from cg_control.nodes import Nodes
 from cg_control.way_home import WayHome
 from cg_dynamics.rig import STANCES
 
-MOST = 60  # knots of the tube that are drawn
+MOST_KNOTS = 60  # knots of the tube that are drawn
 CORNERS = 16  # of each ellipse
 LARGEST = 0.15  # rad, or m of an ellipse: what is wider is drawn so wide
 POSES = 9  # along the line of a surface
@@ -35,11 +35,11 @@ def tube_segments(
 
     Returns:
         'tube_hip' and 'tube_foot' -> (x ahead, z up) of both ends in m, shape (n, 2, 2); at most
-        MOST and MOST * CORNERS segments.
+        MOST_KNOTS and MOST_KNOTS * CORNERS segments.
     """
     on = np.flatnonzero(nodes.orbiting[way.nodes] & ~nodes.impact[way.nodes])
-    if len(on) > MOST:
-        on = on[np.linspace(0, len(on) - 1, MOST).astype(int)]
+    if len(on) > MOST_KNOTS:
+        on = on[np.linspace(0, len(on) - 1, MOST_KNOTS).astype(int)]
     hip, swing = _places(way, on, leg_length, foot)
     J_hip, J_swing = _jacobians(way.states[on], way.stance[on], leg_length)
     spread = _inverse(nodes.F[way.nodes[on]])

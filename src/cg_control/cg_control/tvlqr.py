@@ -157,7 +157,7 @@ def stabilise_periodically(
         trajectory: Periodic, planned for this model.
         model: As in `stabilise`.
         weights: Of deviations; `final` has no part.
-        restarts: The clock starts anew where a foot lands, (RESTART) of docs/walking.md, as
+        restarts: The clock starts anew where a foot lands, (RESTART) of walking.md, as
             with the remedy `event` of tracking.py; else it goes on, (SALT).
 
     Raises:
@@ -345,7 +345,7 @@ def jump_matrix(
         after: The phase that begins.
         slope: Of the ground, rad.
         restarts: The clock of what follows starts at the impact, whenever that is: deviations
-            are compared at the impact itself, and f+ has no part, docs/walking.md, (RESTART).
+            are compared at the impact itself, and f+ has no part, walking.md, (RESTART).
     """
     D = impact_derivative(model, before)
     normal = guard_gradient(before.stance, before.states[-1], slope)

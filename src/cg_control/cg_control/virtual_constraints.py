@@ -5,7 +5,7 @@ leg that stands. The torque makes what differs from it die out as that of a spri
 
     y = q_sw - h(q_st),   d2y/dt2 = -w^2 y - 2 w dy/dt                                 (VC)
 
-No clock and no phase are in it. docs/theory.md, "Virtual constraints", has what follows from it.
+No clock and no phase are in it. theory.md, "Virtual constraints", has what follows from it.
 """
 
 import functools

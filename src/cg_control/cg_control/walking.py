@@ -81,7 +81,7 @@ def orbit_nodes(
     motion = stabilise_over_phase(orbit.trajectory, model, weights)
     nodes = Nodes.orbit(motion, model)
     level = tube_level(nodes, model, tube or TubeOptions(), simulation)
-    # (TUBE) of docs/walking.md: the cost to go says nothing about states ahead on the tangent.
+    # (TUBE) of walking.md: the cost to go says nothing about states ahead on the tangent.
     return Nodes.orbit(motion, model, [
         phase.cost_to_go / level + np.einsum('ni,nj->nij', phase.normals, phase.normals) / LAG**2
         for phase in motion.phases

@@ -9,7 +9,7 @@ from cg_control import tube_view
 from cg_control.routes import UPRIGHT, Routes
 from cg_control.tree import Tree
 from cg_control.tree_files import tree_path
-from cg_control.tube_view import CORNERS, MOST, POSES, surface_segments, tube_segments
+from cg_control.tube_view import CORNERS, MOST_KNOTS, POSES, surface_segments, tube_segments
 from cg_control.way_home import WayHome
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.hybrid import swing_foot
@@ -34,7 +34,7 @@ def test_in_a_small_tube_the_foot_stays_in_the_ellipse_and_comes_to_its_rim(tree
     small = replace(tree.nodes, F=1e6 * tree.nodes.F)
     found = tube_segments(small, way, LENGTH)
     on = np.flatnonzero(small.orbiting[way.nodes] & ~small.impact[way.nodes])
-    assert len(on) <= MOST
+    assert len(on) <= MOST_KNOTS
     rims = found['tube_foot'].reshape(len(on), CORNERS, 2, 2)[:, :, 0]
     feet = way.feet(LENGTH)
     rng = np.random.default_rng(0)
@@ -62,7 +62,7 @@ def test_in_a_small_tube_the_foot_stays_in_the_ellipse_and_comes_to_its_rim(tree
 
 
 def test_a_tube_is_bounded_however_long_and_wide(tree, way, monkeypatch):
-    monkeypatch.setattr(tube_view, 'MOST', 7)
+    monkeypatch.setattr(tube_view, 'MOST_KNOTS', 7)
     flat = replace(tree.nodes, F=1e-9 * tree.nodes.F)
     found = tube_segments(flat, way, LENGTH)
     assert found['tube_hip'].shape == (7, 2, 2)

@@ -1,6 +1,6 @@
 """Model files: one YAML file holds every number of a robot, with unit and source.
 
-This module knows the form of the file (`SCHEMA`, the reference of which is docs/model_file.md) and
+This module knows the form of the file (`SCHEMA`, the reference of which is model_file.md) and
 writes files whole or not at all. What the numbers mean, and which are allowed, is known where the
 physics is, in cg_dynamics.
 """

@@ -5,7 +5,7 @@
 
 A message is one line: file, path inside it, what stands there, what is allowed, such as
 `robot.yaml: effects[2].parameters.mass.value: 'abc' is no number`. The same schema writes the
-reference of the format (docs/model_file.md).
+reference of the format (model_file.md).
 """
 
 import contextlib

@@ -5,7 +5,7 @@
 
 `hip` is the joint that the encoder measures, q_inner - q_outer, so it turns the outer legs
 backward; the hip body follows at half of it and so bisects the legs. The model file holds lumps,
-which many bodies share (docs/theory.md, LUMPS); the masses here are one choice that has them.
+which many bodies share (theory.md, LUMPS); the masses here are one choice that has them.
 """
 
 import math

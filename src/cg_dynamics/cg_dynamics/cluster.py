@@ -9,7 +9,7 @@ each piece of work. They travel as a task and not scattered: what is scattered i
 worker that holds it, a task is done again.
 
 dask serialises with pickle: whoever reaches a port of the cluster can run anything on it. Only
-trusted hosts may (docs/diagnosis.md).
+trusted hosts may (diagnosis.md).
 """
 
 import asyncio

@@ -259,7 +259,7 @@ class Model:
         return replace(self, quantities=quantities)
 
     def require_consistency(self, where: str = 'model') -> None:
-        """Refuse numbers that no real bodies can have (docs/conventions.md, "Lumps").
+        """Refuse numbers that no real bodies can have (conventions.md, "Lumps").
 
         Raises:
             ModelError: if a consistency condition is broken.
@@ -272,7 +272,7 @@ class Model:
             if not value > 0:
                 raise ModelError(
                     f'{where}: no real bodies have these parameters: condition {index + 1} of '
-                    f'the {self.mechanism.name} (docs/conventions.md, "Lumps") is {value:.3g}, '
+                    f'the {self.mechanism.name} (conventions.md, "Lumps") is {value:.3g}, '
                     'it must be positive'
                 )
 

@@ -44,7 +44,7 @@ class Spring:
 
 @dataclass(frozen=True)
 class Setup:
-    """What was done to the rig in one experiment (docs/interfaces.md, "Setup")."""
+    """What was done to the rig in one experiment (interfaces.md, "Setup")."""
 
     stance: str = 'inner'
     fixture: str = 'none'

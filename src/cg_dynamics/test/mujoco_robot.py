@@ -1,7 +1,7 @@
 """The compass gait in MuJoCo: recordings with hidden effects, from an engine that is not ours.
 
 The rigid bodies are MJCF text, effects are joint torques in a callback. Nothing is shared with
-cg_dynamics but the meaning of signs and angles (docs/conventions.md). The hip body that bisects
+cg_dynamics but the meaning of signs and angles (conventions.md). The hip body that bisects
 the legs cannot be a plain link, so the robot has none: c3 and c6 must vanish (`two_links`).
 """
 
@@ -81,7 +81,7 @@ def simulate_mujoco(
 
     Args:
         values: leg_length, total_mass, gravity, c1 .. c6 with c3 and c6 negligible.
-        setup: Anything with `stance`, `fixture` and `springs` as in docs/interfaces.md, "Setup".
+        setup: Anything with `stance`, `fixture` and `springs` as in interfaces.md, "Setup".
         torque: What the drive reports at each sample, held until the next, N m, shape (n,).
         sample_time: In s.
         motion: (q_inner, q_outer) and their rates at the start, of the legs that can move only

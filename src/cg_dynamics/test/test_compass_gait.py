@@ -19,7 +19,7 @@ lc1, lc2, lc3 = 0.41, 0.29, 0.17  # from the hip; legs below it, body 3 above
 
 
 def lumps(stance: str) -> dict[str, float]:
-    """Lumps of docs/conventions.md; leg 1 there is the inner pair."""
+    """Lumps of conventions.md; leg 1 there is the inner pair."""
     mt = m1 + m2 + m3
     c3 = (I3 + m3 * lc3**2) / (4 * mt * l**2)
     standing = (c3 + (I1 + m1 * lc1**2) / (mt * l**2), m1 * lc1 / (mt * l))

@@ -1,4 +1,4 @@
-"""docs/effects.md is what the library would write today."""
+"""effects.md is what the library would write today."""
 
 import importlib.util
 from pathlib import Path

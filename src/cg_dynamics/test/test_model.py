@@ -192,7 +192,7 @@ def test_lumps_of_real_bodies_are_consistent(rng):
 
 
 def test_consistent_lumps_have_real_bodies(rng):
-    """The converse, by building the bodies: the proof in docs/theory.md, LUMPS."""
+    """The converse, by building the bodies: the proof in theory.md, LUMPS."""
     body = MECHANISMS['compass_gait']
     tried = 0
     while tried < 200:

@@ -120,7 +120,7 @@ class ObserverNode(Node):
         self._use()
 
     def on_imu(self, message: Imu) -> None:
-        """Lean of the inner legs, docs/interfaces.md, and its rate."""
+        """Lean of the inner legs, interfaces.md, and its rate."""
         self._read(message, ROBOT.topics[topics.IMU])
 
     def _read(self, message: Imu | JointState, topic: channels.Topic) -> None:

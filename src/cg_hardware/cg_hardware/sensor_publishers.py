@@ -20,7 +20,7 @@ class SensorPublishers:
 
         Args:
             node: Publishes.
-            mechanism: Name of the mechanism, a row of docs/interfaces.md.
+            mechanism: Name of the mechanism, a row of interfaces.md.
             variances: Channel -> variance of its noise, for the covariances of the IMU.
         """
         self.joints = channels.mechanism(mechanism).joints

@@ -41,7 +41,7 @@ class SimulationSettings(Settings):
     )
     initial_state: tuple[float, ...] = setting(
         (),
-        'coordinates of the set-up, then their rates, as in docs/conventions.md; empty for rest '
+        'coordinates of the set-up, then their rates, as in conventions.md; empty for rest '
         'at zero [rad, rad/s]',
     )
     duration: float = setting(
@@ -187,7 +187,7 @@ def noise_variances(model: Model) -> dict[str, float]:
 def recording_note(
     settings: SimulationSettings, mechanism: str, setup: Setup, channels: list[str], zeroed_at: str
 ) -> str:
-    """The YAML text of `/experiment`: docs/interfaces.md, "The recording note"."""
+    """The YAML text of `/experiment`: interfaces.md, "The recording note"."""
     path = model_file_of(settings.note_model_file or settings.model_file)
     rates = settings.initial_state[len(settings.initial_state) // 2 :]
     note = {

@@ -1,4 +1,4 @@
-"""Channels: which field of which topic is which measured quantity (docs/interfaces.md).
+"""Channels: which field of which topic is which measured quantity (interfaces.md).
 
 A channel is one scalar signal with a standard name. A topic feeds one or several channels; its
 extractor takes a message to the channels' values, and its composer goes the other way. Both
@@ -139,7 +139,7 @@ def _drive_enabled(frame_id: str) -> Topic:
 
 
 def _define_mechanisms() -> dict[str, Mechanism]:
-    """The table of docs/interfaces.md."""
+    """The table of interfaces.md."""
     hip = (Channel('hip_torque', 'N m', 'effort', 'hip'),)
     joint = (Channel('torque', 'N m', 'effort', 'joint'),)
     two_joints = (

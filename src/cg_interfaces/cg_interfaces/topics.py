@@ -1,4 +1,4 @@
-"""Names of topics, said once: docs/interfaces.md, "Topics". What flows on them: channels.py."""
+"""Names of topics, said once: interfaces.md, "Topics". What flows on them: channels.py."""
 
 IMU = '/imu'
 HIP_ENCODER = '/hip_encoder'

@@ -2,7 +2,7 @@
 
     from cg_sysid import Model, Options, check, diagnose, identify, read_bag
 
-What `__all__` lists is public and stays (docs/python.md). All else is how it is done, and may move
+What `__all__` lists is public and stays (python.md). All else is how it is done, and may move
 from one version to the next.
 """
 

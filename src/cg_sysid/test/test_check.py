@@ -393,7 +393,7 @@ def test_the_command_line_overrules_and_lists_what_can_be(tmp_path, capsys):
 
 
 def test_every_code_is_documented():
-    text = (Path(__file__).parents[3] / 'docs' / 'data.md').read_text(encoding='utf-8')
+    text = (Path(__file__).parents[3] / 'docs/reference/data.md').read_text(encoding='utf-8')
     table = text.split('## Check')[1].split('\n## ')[0]
     rows = [line.split('|')[1] for line in table.splitlines() if line.startswith('| `')]
     listed = {code for row in rows for code in re.findall(r'`(\w+)`', row)}

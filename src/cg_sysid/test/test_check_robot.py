@@ -297,7 +297,7 @@ def test_a_step_within_the_play_of_the_model_is_odd_only(sound, tmp_path, gap, v
 
 
 def test_a_joint_at_rest_may_slip_as_far_as_friction_allows():
-    # The pendulum rests within 18 mrad (docs/results.md); this one slips between two samples.
+    # The pendulum rests within 18 mrad (results.md); this one slips between two samples.
     time = np.arange(4000) / 500.0
     swing = 0.5 * np.sin(4.0 * time) * np.clip(time - 5.0, 0.0, 1.0) ** 3
     for size, verdict in ((0.012, 'warnings'), (0.03, 'unusable')):

@@ -165,7 +165,7 @@ BAD = {
         '--model {m} --out {tmp}/o {tmp}/log.csv {a}',
         '{tmp}/log.csv: a log, no bag; a mapping file says which column is which channel, then '
         '`cg import MAPPING.yaml {tmp} --out bags` makes bags of it '
-        '(docs/data.md, "Import of foreign logs")',
+        '(data.md, "Import of foreign logs")',
     ),
     'the same bag twice': ('--model {m} --out {tmp}/o {a} {a}', '{a}: given twice'),
     'one record only': (

@@ -12,7 +12,7 @@ from cg_dynamics.model import Model
 from cg_sysid.report import curves
 from cg_sysid.report.diagnosis_file import interval, plain, read_facts, unusable_facts, write_facts
 
-DOCS = Path(__file__).parents[3] / 'docs' / 'diagnosis_json.md'
+DOCS = Path(__file__).parents[3] / 'docs/reference/diagnosis_json.md'
 
 
 def documented(title):

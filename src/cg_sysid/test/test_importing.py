@@ -1,6 +1,6 @@
 """Imports: expressions and splits on small tables, then each real data set that comes along.
 
-The real data are public (docs/data.md) and no part of the project. Tests that need them look in
+The real data are public (data.md) and no part of the project. Tests that need them look in
 the folder named by CG_DATA, or in ../shared/data beside the repository, and are skipped without.
 """
 
@@ -32,7 +32,7 @@ DATA = Path(os.environ.get('CG_DATA', REPOSITORY.parent / 'shared' / 'data'))
 def data(folder):
     """Folder of a real data set, or a skip that says why."""
     if not (DATA / folder).is_dir():
-        pytest.skip(f'no {folder} under {DATA}: get it as docs/data.md says and set CG_DATA')
+        pytest.skip(f'no {folder} under {DATA}: get it as data.md says and set CG_DATA')
     return DATA / folder
 
 

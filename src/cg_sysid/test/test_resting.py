@@ -12,7 +12,7 @@ PENDULUM = Model.load(model_path('sydney_pendulum'))
 
 
 def test_a_pendulum_rests_within_friction_over_weight():
-    # 0.00545 N m over 0.307 N m: docs/results.md, and the viscous share at 0.05 rad/s.
+    # 0.00545 N m over 0.307 N m: results.md, and the viscous share at 0.05 rad/s.
     band = resting_band(PENDULUM, Setup())
     assert band['angle'] == pytest.approx(0.018, rel=0.02)
 

@@ -1,6 +1,6 @@
 """The compass gait: two leg pairs, a hip body that bisects them, a point foot as pivot.
 
-The energies are written once in the six lumps of docs/conventions.md for both stance legs; with
+The energies are written once in the six lumps of conventions.md for both stance legs; with
 d(a) = (sin a, cos a) the direction of a body that leans by a, l the leg length and h the hip,
 
     h = l d(q_st)                                                      (CG1)

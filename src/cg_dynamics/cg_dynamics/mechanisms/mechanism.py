@@ -95,7 +95,7 @@ class Mechanism(ABC):
     @abstractmethod
     def point(self, body: str, distance, q: ca.SX, p: Symbols, setup: Setup) -> ca.SX:
         """World position (x, z) in m of the point of `body` at `distance` m from its lower
-        or proximal end (docs/conventions.md).
+        or proximal end (conventions.md).
         """  # noqa: D205
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Contact of a foot with the ground: landing, rebound, sliding: docs/theory.md, "Contact".
+"""Contact of a foot with the ground: landing, rebound, sliding: theory.md, "Contact".
 
 The ground falls by `slope` ahead, n and t are its normal and its direction ahead. A foot that
 touches it with velocity u receives the impulse P,

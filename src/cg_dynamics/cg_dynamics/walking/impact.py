@@ -1,4 +1,4 @@
-"""Impact of the swing foot: docs/theory.md, "Impact".
+"""Impact of the swing foot: theory.md, "Impact".
 
 The swing foot r(q4) sticks where it lands, the ground pushes on that foot alone, and angles do
 not change. With A = dr/dq4 of the unpinned model (Eq. 4.10 times the leg length),

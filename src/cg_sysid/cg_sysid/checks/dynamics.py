@@ -29,7 +29,7 @@ MISALIGNED = 0.5  # the same for a topic that ends before the others, [1]
 CHANGED = 0.5  # the law of a part leaves less than this share of what that of all leaves, [1]
 PLACES = 40  # instants that are tried
 SPLITS = 8  # of them, at which the parts are tried first
-FEWEST = 40  # averages in a part
+FEWEST_AVERAGES = 40  # averages in a part
 RATHER = 2.0  # a torque turns rather than an angle, which would jump: leaves at most this more
 RATES = (2, 3, 4, 5, 10)  # ratios of sampling rates that are tried
 MOVED = 6.0  # standard errors of a term that makes a fault, [1]
@@ -159,7 +159,7 @@ def _changes(motion: Motion, torque: str, angle: str, law: Law) -> bool:
     for at in _places(motion)[:: PLACES // SPLITS]:
         rows = motion.away_from(at)
         for part in (rows & (motion.time < at), rows & (motion.time > at)):
-            if part.sum() < FEWEST:
+            if part.sum() < FEWEST_AVERAGES:
                 continue
             left = fit_law(motion, torque, angle, rows=part).unexplained
             if left < CHANGED * law.unexplained:

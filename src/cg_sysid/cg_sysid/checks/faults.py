@@ -10,7 +10,7 @@ from cg_sysid.records.findings import CheckReport, Finding
 from cg_sysid.records.raw import RawRecording
 from cg_sysid.records.record import NS_PER_S
 
-MOST = 4  # faults of one recording
+MOST_FAULTS = 4  # faults of one recording
 LEAST_CONTEXT = 0.5  # s before and after a fault
 
 
@@ -47,7 +47,7 @@ def fault_signals(raw: RawRecording, report: CheckReport) -> tuple[FaultSignal, 
         report: What the check says about it.
     """
     placed = [f for f in report.findings if f.severity == 'error' and f.start_s is not None]
-    found = (_around(raw, report.name, finding) for finding in placed[:MOST])
+    found = (_around(raw, report.name, finding) for finding in placed[:MOST_FAULTS])
     return tuple(signal for signal in found if signal is not None)
 
 

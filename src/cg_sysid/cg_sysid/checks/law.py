@@ -24,7 +24,7 @@ LEAST_HALF_WIDTH = 8  # samples
 WEIGHT = Polynomial([1.0, 0.0, -1.0]) ** 4  # (1 - s^2)^4 on -1..1: three smooth derivatives
 SLIDING = (0.03, 0.3)  # of the usual rate, at which friction has its full size, [1]
 MOVES = 10.0  # an angle that moves over this many noise floors belongs to the law, [1]
-FEWEST = 60  # averages that a law needs
+FEWEST_FOR_LAW = 60  # averages that a law needs
 NEGLIGIBLE = 1e-7  # singular values below this share are dropped, [1]
 
 
@@ -117,7 +117,7 @@ def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
     start, stop = max(s.time[0] for s in every), min(s.time[-1] for s in every)
     spacing = max(float(np.median(np.diff(s.time))) for s in moving.values())
     reach = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
-    if (stop - start) / (0.5 * reach * spacing) < FEWEST:
+    if (stop - start) / (0.5 * reach * spacing) < FEWEST_FOR_LAW:
         return None
     grid = np.arange(start, stop, spacing)
     weights = [_weight(reach, spacing, order) for order in range(3)]

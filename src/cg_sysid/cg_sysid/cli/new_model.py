@@ -3,7 +3,7 @@
     cg new-model MECHANISM > my_robot.yaml
 
 The file loads as it is. It holds every key that this mechanism can have, with unit and range; its
-numbers are those of a model that comes along, to be replaced. docs/model_file.md is the reference.
+numbers are those of a model that comes along, to be replaced. model_file.md is the reference.
 """
 
 import argparse
@@ -31,14 +31,14 @@ HEAD = """\
 #   tolerance  one standard deviation of what you believe about the value
 #   fixed      true: identification leaves the number alone
 #   source     where the number comes from: scales, a data sheet, assumed
-# The reference of all keys is docs/model_file.md.
+# The reference of all keys is model_file.md.
 """
 EFFECTS = """\
 # What the robot has beyond rigid bodies, in the order in which it acts. `at` says at which joint,
 # body or sensor, where it is not the usual one. A diagnosis finds what is missing by itself.
 """
 OTHERS = """\
-# The others that this mechanism can have (docs/effects.md says more). One without `parameters`
+# The others that this mechanism can have (effects.md says more). One without `parameters`
 # takes the values at which an identification starts.
 """
 SENSORS = """\

@@ -23,8 +23,8 @@ from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, candidates_for, started_from
 from cg_sysid.search.nuisance import turning
 
-FEWEST = 3  # recordings: two always differ
-MOST = 30  # recordings; of more, as the steps of a walk, none is a session
+FEWEST_RECORDINGS = 3  # recordings: two always differ
+MOST_RECORDINGS = 30  # recordings; of more, as the steps of a walk, none is a session
 EXPLAINS = 0.7  # share of the error above the noise that a number must take away
 CLEARLY = 0.5  # of what the next best number leaves, that the best may leave
 ITERATIONS = 24
@@ -47,7 +47,7 @@ def what_wanders(
             what for.
     """
     recordings = list(dict.fromkeys(data_set.recording for data_set in data_sets))
-    if not FEWEST <= len(recordings) <= MOST:
+    if not FEWEST_RECORDINGS <= len(recordings) <= MOST_RECORDINGS:
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     numbers = list(numbers_of(o.train.model, data_sets, names))

@@ -7,7 +7,7 @@
          better in its place? If so, exchange it and go on from there
       -> with all of that in the model: how do the feet of a walking robot land?
 
-docs/diagnosis.md says how the decisions are taken and why.
+diagnosis.md says how the decisions are taken and why.
 """
 
 from collections.abc import Sequence

@@ -29,7 +29,7 @@ MOST_ROUNDS = 4
 
 
 class Verdict(str, Enum):
-    """What a diagnosis says of records: docs/diagnosis.md, section 6."""
+    """What a diagnosis says of records: diagnosis.md, section 6."""
 
     CONSISTENT = 'consistent'
     EXPLAINED = 'explained'

@@ -1,6 +1,6 @@
 """Experiments as data: which set-up, start, excitation and duration.
 
-Each file of config/experiments is one experiment of docs/experiments.md. No ROS here.
+Each file of config/experiments is one experiment of experiments.md. No ROS here.
 """
 
 from collections.abc import Mapping

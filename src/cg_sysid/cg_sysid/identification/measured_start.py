@@ -1,7 +1,7 @@
 """Does a cause help where each record starts at the angles that were measured?
 
 A diagnosis fits the initial motion of held-out records, as no recording states it exactly. Others
-(the walking compass gait of Sydney, docs/data.md) start from the measured angles and fit the rates
+(the walking compass gait of Sydney, data.md) start from the measured angles and fit the rates
 alone. A cause worth its name gains under both. Measured is what a curve through the first samples
 of each channel says (data set.measured_motion), and each model starts where its sensors read that.
 

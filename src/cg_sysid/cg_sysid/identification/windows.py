@@ -34,7 +34,7 @@ from cg_sysid.records.record import Record
 FOLLOWED = 100.0
 SHORTEST_WINDOW = 0.5  # s; less holds no motion to compare
 PIECE_S = 0.1  # of which sensitivities are chained; a measured start carries as far anywhere
-FEWEST = 3  # samples of some channel from which a start is measured
+FEWEST_AT_START = 3  # samples of some channel from which a start is measured
 NUDGE = 1e-6  # rad, rad/s (m, m/s): of central differences, far below friction's corner
 SLOWEST, FASTEST = 1.0, 30.0  # rad/s: a motion's frequency, where rest or noise would say others
 
@@ -156,7 +156,7 @@ def sensitivities(model: Model, data_set: DataSet) -> tuple[np.ndarray, list[np.
     starts, motions = [], []
     for a in np.unique(edges):
         rows = slice(a, np.searchsorted(time, time[a] + PIECE_S, side='right'))
-        if np.isfinite(data_set.outputs[rows]).sum(axis=0).max() < FEWEST:
+        if np.isfinite(data_set.outputs[rows]).sum(axis=0).max() < FEWEST_AT_START:
             continue  # samples are missing there: the piece before goes on
         starts.append(a)
         motions.append(

@@ -19,7 +19,7 @@ from cg_sysid.landings.landings import STEP_S, Passage
 from cg_sysid.landings.result import Impulse
 
 AFTER_S = 0.02  # s after the touchdown that the parabolas see
-FEWEST = 6  # samples
+FEWEST_IN_PARABOLA = 6  # samples
 
 
 def measure_impulse(
@@ -76,7 +76,7 @@ def _rates_after(
         j = names.index(name)
         values = passage.outputs[:, j]
         rows = (since > 0) & (since <= AFTER_S) & np.isfinite(values)
-        if rows.sum() < FEWEST:
+        if rows.sum() < FEWEST_IN_PARABOLA:
             continue
         solve = np.linalg.pinv(np.vander(since[rows], degree + 1, increasing=True))
         weights = solve[0] if name == 'imu_rate' else solve[1]

@@ -25,8 +25,8 @@ from cg_sysid.landings.result import Impulse, Landings, LawTried
 from cg_sysid.search import settings
 from cg_sysid.stances.phases import Landing
 
-MOST = 12  # landings that are fitted, and as many that judge
-FEWEST = 2  # of each
+MOST_LANDINGS = 12  # landings that are fitted, and as many that judge
+FEWEST_LANDINGS = 2  # of each
 # Blocks on which a gain is tested: short where landings are few, long where a gain is small.
 BLOCKS_S = (0.025, 0.05, 0.1, 0.3)
 # A rebound of a tenth lasts for ten milliseconds and explains about one standard deviation.
@@ -59,7 +59,7 @@ def judge_landings(
     model = without_events(model)
     passages = ready(model, landings, sigma)
     train, held = _split(passages)
-    if min(len(train), len(held)) < FEWEST:
+    if min(len(train), len(held)) < FEWEST_LANDINGS:
         return None
     stated = contact_law(model)
     task = ContactTask(model, stated, (), train, held, sigma)
@@ -97,9 +97,11 @@ def _split(
 
 def _some(passages: Sequence[Passage]) -> list[Passage]:
     """At most so many of them, from the first to the last."""
-    if len(passages) <= MOST:
+    if len(passages) <= MOST_LANDINGS:
         return list(passages)
-    return [passages[k] for k in np.linspace(0, len(passages) - 1, MOST).round().astype(int)]
+    return [
+        passages[k] for k in np.linspace(0, len(passages) - 1, MOST_LANDINGS).round().astype(int)
+    ]
 
 
 def _fits(run: Run, task: ContactTask, effects: Sequence[tuple[str, ...]]) -> list[ContactFit]:

@@ -5,7 +5,7 @@
       -> the best few fitted by simulation, on windows of a few pieces, and judged like any effect
       -> the winner fitted to whole records: a function with its band (shape.py), and words for it
 
-docs/diagnosis.md says why.
+diagnosis.md says why.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence

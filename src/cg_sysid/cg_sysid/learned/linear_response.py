@@ -27,7 +27,7 @@ from cg_sysid.identification.identify import fit, in_data_set, score
 from cg_sysid.identification.unknowns import Unknown, awake
 
 PIECES_S = (0.5, 0.2, 0.1, 0.05)
-FEWEST = 5  # samples of every output in a piece
+FEWEST_IN_PIECE = 5  # samples of every output in a piece
 CLOSE = 30.0  # chi2 per sample on a piece up to which it is short enough to be linear
 PROBED = 5  # one of so many pieces tells whether they are short enough
 MOST_PIECES = 480  # of all records together; what is beyond adds little
@@ -157,7 +157,7 @@ def cut(model: Model, data_set: DataSet, length: float) -> list[DataSet]:
         # A piece begins where it is first seen.
         a += int(np.argmax(np.isfinite(data_set.outputs[a:b]).any(axis=1)))
         time, outputs = data_set.time[a:b] - data_set.time[a], data_set.outputs[a:b]
-        if (np.isfinite(outputs).sum(axis=0)[recorded] < FEWEST).any():
+        if (np.isfinite(outputs).sum(axis=0)[recorded] < FEWEST_IN_PIECE).any():
             continue
         motion, spread = initial_motion(
             model.mechanism, data_set.setup, time, outputs, data_set.sigma

@@ -21,7 +21,7 @@ RARE = 0.1  # share of an even spread of the samples from which a place of the g
 SURE = 2.0  # standard deviations from which a value of the function counts
 PURE = 0.9  # share of its power from which a function is called even or odd
 SYMMETRIC = 0.3  # least share of the range on the other side of zero to judge that
-MOST = 0.9  # of the power of a function that lies in one stretch
+MOST_OF_POWER = 0.9  # of the power of a function that lies in one stretch
 VARIES = 0.25  # of its mean: a function that varies less is a constant
 SHORT = 0.4  # share of the range up to which such a stretch is worth saying
 
@@ -154,7 +154,7 @@ def _stretch(s: np.ndarray, value: np.ndarray) -> tuple[float, float] | None:
     if power[-1] <= 0:
         return None
     starts = np.arange(len(s))
-    stops = np.searchsorted(power, power[:-1] + MOST * power[-1])
+    stops = np.searchsorted(power, power[:-1] + MOST_OF_POWER * power[-1])
     lengths = np.where(stops < len(power), stops - starts, len(power))
     first = int(np.argmin(lengths))
     if lengths[first] > SHORT * len(s):

@@ -1,7 +1,7 @@
 """Whether a bag may be given to a reader that trusts it: complete, undamaged, of bounded size.
 
 `rosbags` reads what lengths and indices say and unpacks whatever it is given. So each file is
-looked through first, within the limits of docs/interfaces.md.
+looked through first, within the limits of interfaces.md.
 """
 
 import sqlite3
@@ -140,7 +140,7 @@ def no_bag(path: Path) -> RecordingError:
         return RecordingError(
             f'{path}: {kind}, no bag; a mapping file says which column is which channel, then '
             f'`cg import MAPPING.yaml {folder} --out bags` makes bags of it '
-            '(docs/data.md, "Import of foreign logs")'
+            '(data.md, "Import of foreign logs")'
         )
     return RecordingError(
         f'{path}: not a bag; a directory with metadata.yaml and .mcap or .db3 files is needed'

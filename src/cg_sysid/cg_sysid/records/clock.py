@@ -21,9 +21,9 @@ from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording, RawTopic
 from cg_sysid.records.record import NS_PER_S
 
-FEWEST = 100  # samples of a topic whose clock is looked at
+FEWEST_SAMPLES = 100  # samples of a topic whose clock is looked at
 REGULAR = 0.25  # stamps are regular where most spacings are this close to the usual one, [1]
-MOST = 0.9  # [1]
+MOST_REGULAR = 0.9  # [1]
 OUT_OF_LINE = 0.4  # deviation of a spacing that may be a jump, in usual spacings, [1]
 MOST_HOLES = 50  # holes behind regular stamps that are looked at
 MUCH = 1.02  # arrivals take this much longer than stamps: many samples are lost, [1]
@@ -89,11 +89,11 @@ def mend_clocks(raw: RawRecording) -> tuple[RawRecording, list[Finding]]:
 def usual_spacing(stamp_ns: np.ndarray) -> float:
     """Spacing of regular stamps in ns; 0 where they are not regular, or too few to tell."""
     spacing = np.diff(stamp_ns)
-    if len(spacing) < FEWEST:
+    if len(spacing) < FEWEST_SAMPLES:
         return 0.0
     usual = float(np.median(spacing))
     near = np.abs(spacing - usual) < REGULAR * usual
-    return usual if usual > 0 and np.mean(near) > MOST else 0.0
+    return usual if usual > 0 and np.mean(near) > MOST_REGULAR else 0.0
 
 
 def independent_arrivals(topic: RawTopic) -> bool:
@@ -127,7 +127,7 @@ def lost_behind_stamps(topic: RawTopic, end_ns: float) -> tuple[list[int], int]:
     if np.ptp(topic.log_ns) > MUCH * np.ptp(topic.stamp_ns):
         # A machine that is too slow is not late by whole samples.
         whole = np.abs(np.diff(offset) - late) < REGULAR
-        odds -= 3.0 * WITNESS if np.mean(whole) > MOST else 0.0
+        odds -= 3.0 * WITNESS if np.mean(whole) > MOST_REGULAR else 0.0
     else:
         # Few are lost, if any. A message held up on its way is late too, but not for good.
         level = np.median(np.lib.stride_tricks.sliding_window_view(offset, 5), axis=1)
@@ -248,7 +248,7 @@ def _prediction(values: np.ndarray, k: int, elapsed: float) -> tuple[float, floa
     middle = 0.5 * (AHEAD - 1)
     shift = SIDE - 1 + round(elapsed)
     first, last = max(0, -shift), min(len(before), len(target) - shift)
-    if last - first < FEWEST // 2:
+    if last - first < FEWEST_SAMPLES // 2:
         return None
     best = None
     for degree in (0, 1, 2):

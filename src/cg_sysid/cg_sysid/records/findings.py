@@ -39,7 +39,7 @@ class Finding:
     """One thing that a check has to say about a recording.
 
     Attributes:
-        code: Standard name, such as `gap`; listed in docs/data.md.
+        code: Standard name, such as `gap`; listed in data.md.
         severity: `info`, `warning`, or `error` (the recording is unusable).
         where: Topic or channel; empty where it is about the whole recording.
         message: One sentence for people, without the repair.

@@ -2,7 +2,7 @@
 
     cg import sydney_pendulum DATA_DIR --out BAGS
 
-A mapping (`cg_import/1`, docs/data.md) names the files, the time column, the expression
+A mapping (`cg_import/1`, data.md) names the files, the time column, the expression
 (expressions.py) of each channel, filters and splits of rows, and the recording note. The bags
 that come out are the same as those that the robot records.
 """

@@ -20,7 +20,7 @@ from cg_sysid.records.noise import WIDTHS, contrasts, resolution
 
 CLASSES = 12  # of like rate, each with as many samples
 PARTS = 10  # of the record, in time: they show how sure the answer is
-FEWEST = 600  # samples; 50 in each class
+FEWEST_FOR_JITTER = 600  # samples; 50 in each class
 MEDIAN = 0.4549  # median of the square of a standard normal number
 REACH = 3  # samples on either side that the rate is the slope over
 CERTAIN = 3.5  # standard errors from which the slope is one: the errors are of ten parts
@@ -98,7 +98,7 @@ def _contradicts(line: _Line, slope: float) -> bool:
 
 def _line(time: np.ndarray, values: np.ndarray) -> _Line | None:
     """The line of a channel; None where it has too few samples that move."""
-    if len(values) < FEWEST or np.ptp(values) == 0.0:
+    if len(values) < FEWEST_FOR_JITTER or np.ptp(values) == 0.0:
         return None
     rate = np.zeros(len(values))
     reach = slice(2 * REACH, None), slice(None, -2 * REACH)
@@ -119,7 +119,7 @@ def _fitted(
     inner = slice(half, len(values) - half)
     use = moving[inner]
     use[:REACH] = use[-REACH:] = False
-    if use.sum() < FEWEST:
+    if use.sum() < FEWEST_FOR_JITTER:
         return None
     square = contrasts(time, values - values[0], width)[use] ** 2
     speed = rate[inner][use] ** 2

@@ -18,7 +18,7 @@ USUAL = 3.0  # distance over that around it, where the motion is rougher than pa
 AROUND = 3  # spans on each side that show what is usual, but 100 samples at least
 AGREE = 0.3  # distances of two spans differ by less than this share, and noise
 KNOCK_S = 0.02  # s within which two branches meet that a knock, or some bounces, part
-# A fit tells the zero of a recording to 0.3 to 0.6 mrad (docs/results.md): less cannot be seen.
+# A fit tells the zero of a recording to 0.3 to 0.6 mrad (results.md): less cannot be seen.
 FINE = {'rad': 1e-3, 'm': 1e-4}
 FINE_SHARE = 1e-3  # of the motion: the torques that follow from an angle are off by no more, [1]
 HOLE = 1.8  # spacing over the usual one in which a motion may turn unseen, [1]

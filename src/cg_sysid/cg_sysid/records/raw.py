@@ -11,7 +11,7 @@ from cg_dynamics.rig import Setup
 from cg_sysid.errors import RecordingError
 
 NOTE_FORMAT = 'cg_recording/1'
-# docs/interfaces.md, "The recording note". The set-up has a reader of its own.
+# interfaces.md, "The recording note". The set-up has a reader of its own.
 NOTE = Mapping({
     'format': Key(Text((NOTE_FORMAT,)), default=NOTE_FORMAT),
     'experiment': Key(Text(), default=''),

@@ -17,8 +17,8 @@ STEADY = 0.15  # the spacings beside it too, or the loop that stamps was only sl
 # of a quarter of a second, in which a leg's motion answers a torque.
 KNOWN_S = 0.0025
 QUANTILE = 0.95  # of the errors of such fills elsewhere
-FEWEST = 40  # samples, or stretches, from which anything is concluded
-MOST = 0.9  # share of the spacings that must fit the grid, [1]
+FEWEST_SPACINGS = 40  # samples, or stretches, from which anything is concluded
+MOST_SPACINGS = 0.9  # share of the spacings that must fit the grid, [1]
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class TorqueGap:
 def grid_spacing(stamp_ns: np.ndarray) -> float:
     """Spacing in ns of which most spacings are whole multiples; 0 where there is none."""
     spacing = np.diff(stamp_ns)
-    if len(spacing) < FEWEST:
+    if len(spacing) < FEWEST_SPACINGS:
         return 0.0
     short = spacing < 1.5 * np.quantile(spacing, 0.1)
     usual = float(np.median(spacing[short])) if short.any() else 0.0
     if usual <= 0:
         return 0.0
     off = np.abs(spacing / usual - np.rint(spacing / usual))
-    return usual if np.mean(off < 0.25) > MOST else 0.0
+    return usual if np.mean(off < 0.25) > MOST_SPACINGS else 0.0
 
 
 def torque_gaps(stamp_ns: np.ndarray, values: np.ndarray) -> list[TorqueGap]:
@@ -135,7 +135,7 @@ def _fill_error(values: np.ndarray, whole: np.ndarray, lost: int) -> float:
         return float('inf')
     n = len(values) - steps - 2
     there = np.lib.stride_tricks.sliding_window_view(whole, steps + 2).all(axis=1)
-    if there.sum() < FEWEST:
+    if there.sum() < FEWEST_SPACINGS:
         return float('inf')
     before, start = values[:n], values[1 : n + 1]
     stop, after = values[1 + steps : n + 1 + steps], values[2 + steps : n + 2 + steps]

@@ -1,4 +1,4 @@
-"""The facts of a diagnosis or identification as JSON: docs/diagnosis_json.md.
+"""The facts of a diagnosis or identification as JSON: diagnosis_json.md.
 
 One builder makes the plain data, one pair of functions writes and reads it. The report is drawn
 from this file and curves.npz alone.

@@ -1,6 +1,6 @@
 """Is an effect earned? The judgement of candidates against the model that they extend.
 
-The conditions and why they are what they are: docs/diagnosis.md, section 4.
+The conditions and why they are what they are: diagnosis.md, section 4.
 """
 
 from collections.abc import Sequence

@@ -24,7 +24,7 @@ from cg_sysid.records.record import Record
 
 NEEDED = ('imu_angle', 'hip_angle')
 SPAN_S = 0.024  # of the parabolas on each side of an instant
-FEWEST = 6  # samples in them
+FEWEST_IN_STRETCH = 6  # samples in them
 JUMP = 6.0  # standard deviations of a jump of the rates
 NEAR_S = 0.012  # s within which the largest jump is the instant that is meant
 STEEPEST = 0.25  # rad, of ground on which anybody walks
@@ -167,7 +167,7 @@ def _sides(record: Record) -> _Sides | None:
         return None
     times = {channel: record.samples(channel)[0] for channel in record.outputs}
     spacing = max(float(np.median(np.diff(t))) for t in times.values() if len(t) > 1)
-    span = max(FEWEST, round(SPAN_S / spacing))
+    span = max(FEWEST_IN_STRETCH, round(SPAN_S / spacing))
     if min(len(t) for t in times.values()) < 4 * span:
         return None
     grid, signals = np.empty(0), {}
@@ -250,7 +250,7 @@ class Pieces:
             c: v[rows] for c, v in self.record.outputs.items() if np.isfinite(v[rows]).any()
         }
         seen = (np.isfinite(outputs.get(c, np.empty(0))).sum() for c in NEEDED)
-        if min(seen) < FEWEST:
+        if min(seen) < FEWEST_IN_STRETCH:
             return np.nan
         piece = replace(
             self.record,
