@@ -11,6 +11,8 @@ NAME = 'cg_hardware'
 NODES = [
     'simulation_node = cg_hardware.simulation_node:main',
     'safety_gate_node = cg_hardware.safety_gate_node:main',
+    'imu_node = cg_hardware.imu_node:main',
+    'drive_node = cg_hardware.drive_node:main',
 ]
 
 

@@ -175,6 +175,18 @@ class StampedEstimator(ABC):
         self._estimate = Estimate(stamp_ns, self.stance, self._x.copy(), running, blind)
         return self._estimate
 
+    def forward(self, outputs: Outputs, late: Mapping[str, float]) -> Outputs:
+        """Readings brought forward to the stamp by the rates that are believed now.
+
+        Args:
+            outputs: Channel -> reading.
+            late: Channel -> age of a reading in s; only the hip angle can be late.
+        """
+        if not late or self._estimate is None:
+            return outputs
+        rate = self._x[2] - self._x[3]
+        return {**outputs, 'hip_angle': outputs['hip_angle'] + late['hip_angle'] * rate}
+
     @abstractmethod
     def _begin(self, motion: np.ndarray, torque: float) -> None:
         """Set `self._x` from measured angles and first guesses of the rates, shape (4,)."""

@@ -158,7 +158,10 @@ class ObserverNode(Node):
             settings = self.declared.values
             tune(self.estimator, settings)
             estimate = self.estimator.step(
-                measurement.stamp_ns, measurement.torque, measurement.outputs, measurement.stance
+                measurement.stamp_ns,
+                measurement.torque,
+                self.estimator.forward(measurement.outputs, measurement.late),
+                measurement.stance,
             )
             self._publish(estimate, settings.longest_blind)
             self._last_ns = measurement.stamp_ns

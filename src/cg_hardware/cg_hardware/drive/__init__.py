@@ -1,0 +1,1 @@
+"""The motor drive: CiA 402 over CANopen. No ROS."""

@@ -1,0 +1,305 @@
+"""A drive on a CAN bus: set up by SDO, led by PDO, watched by heartbeat. No ROS.
+
+Every cycle the host sends the controlword and the torque, then SYNC; the drive lets the torque act
+at that SYNC, and answers with statusword, position and torque of the same instant. Three watches
+look at each other: the drive at the host's heartbeat and at the torque's PDO, the host at the
+drive's answers. Whichever is silent, the torque is zero: in the drive, because it faults; here,
+because the drive then is not enabled, and is enabled again only by `enable`.
+
+    RPDO 1  0x200 + node   controlword (uint16), target torque (int16, per mille of rated)
+    TPDO 1  0x180 + node   statusword (uint16), position (int32, counts), torque (int16)
+    TPDO 2  0x280 + node   digital inputs (uint32), when they change, and every 50 ms
+"""
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import can
+import canopen
+
+from cg_hardware.drive import cia402
+from cg_hardware.drive.cia402 import State
+
+HOST = 0x7F  # node number of the host's heartbeat
+SYNC, HEARTBEAT = 0x080, 0x700
+COMMAND = struct.Struct('<Hh')
+ANSWER = struct.Struct('<Hih')
+OFF = 1 << 31  # bit of a COB-ID: the object is off
+AT_SYNC, AT_CHANGE = 1, 255  # when a PDO is sent
+INPUTS_MS = 50  # in which the inputs come again, changed or not
+PRESENT = 402  # low half of the device type
+SILENCE_S = 0.015  # s without an answer after which the drive counts as lost
+PATIENCE_MS = 18  # for which the drive waits for the host's heartbeat and torque: 20 less a cycle
+DRIVE_HEARTBEAT_MS = 10
+OPERATIONAL = 0x05
+FAULTS = (State.REACTING, State.FAULT)
+
+
+class DriveError(Exception):
+    """A drive that is not there, refuses its set-up, or reports a fault."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the drive said at one SYNC.
+
+    Attributes:
+        sync_ns: When the SYNC went out, host's clock.
+        state: Of the drive.
+        counts: Position.
+        torque: In N m at the joint, as the drive reports it.
+        inputs: Digital inputs, as they last came.
+    """
+
+    sync_ns: int
+    state: State
+    counts: int
+    torque: float
+    inputs: int
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Torque at the joint, and what the drive calls it.
+
+    Attributes:
+        rated: Torque in N m at the joint that is 1000 per mille.
+        sign: 1.0, or -1.0 where the drive's positive torque turns the joint backward.
+    """
+
+    rated: float
+    sign: float = 1.0
+
+    def target(self, torque: float) -> int:
+        """Per mille of rated torque for a torque in N m, as far as 16 bits go."""
+        found = round(cia402.PER_MILLE * self.sign * torque / self.rated)
+        return max(-cia402.LARGEST_TARGET, min(cia402.LARGEST_TARGET, found))
+
+    def torque(self, target: int) -> float:
+        """Torque in N m for per mille of rated torque."""
+        return self.sign * target * self.rated / cia402.PER_MILLE
+
+
+class CanDrive:
+    """One drive.
+
+    Args:
+        bus: What python-can needs to open the bus: interface, channel, bitrate.
+        node: Number of the drive on it.
+        sign: Of its torque, `Scale`.
+        gear: Torque at the joint per torque of the motor, where the rated one is the motor's.
+        wall_ns: Clock of the answers.
+
+    Attributes:
+        answers: What the drive said since they were last taken, oldest first.
+        wanted: Whether it is led to operation enabled.
+        reason: Why it is not enabled, in words; empty while nothing is wrong.
+
+    Raises:
+        DriveError: naming bus, drive and what was missing.
+    """
+
+    def __init__(
+        self,
+        bus: dict,
+        node: int,
+        sign: float = 1.0,
+        gear: float = 1.0,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ):
+        self.node, self._wall_ns = node, wall_ns
+        self.answers: deque[Answer] = deque(maxlen=1000)
+        self.wanted, self.reason = False, ''
+        self._lock = threading.Lock()
+        self._heard = threading.Event()
+        self._sync_ns = 0
+        self._answered = 0.0
+        self._last: Answer | None = None
+        self._emergency = ''
+        self._inputs = 0
+        self._reset = False
+        self._open(bus)
+        try:
+            rated = self._set_up() * gear
+        except (canopen.SdoError, can.CanError, OSError, struct.error) as error:
+            self.close()
+            raise DriveError(f'drive {node} on {told(bus)}: {error}') from error
+        self.scale = Scale(rated, sign)
+
+    def _open(self, bus: dict) -> None:
+        self._network = canopen.Network()
+        try:
+            self._network.connect(**bus)
+        except (can.CanError, OSError, ValueError) as error:
+            raise DriveError(f'{told(bus)}: {error}') from error
+        self._remote = canopen.RemoteNode(self.node, canopen.ObjectDictionary())
+        self._network.add_node(self._remote)
+        self._remote.sdo.RESPONSE_TIMEOUT = 0.3
+        self._network.subscribe(0x180 + self.node, self._on_answer)
+        self._network.subscribe(0x280 + self.node, self._on_inputs)
+        self._remote.emcy.add_callback(self._on_emergency)
+
+    def _set_up(self) -> float:
+        """Tell the drive what to send, what to expect, and how to drive; its rated torque, N m."""
+        sdo = self._remote.sdo
+        kind = int.from_bytes(sdo.upload(0x1000, 0), 'little')
+        if kind & 0xFFFF != PRESENT:
+            raise OSError(f'is no CiA 402 drive: its device type is 0x{kind:08x}')
+        self._remote.nmt.send_command(0x80)  # pre-operational: mappings may change
+        self._write(0x1017, 0, DRIVE_HEARTBEAT_MS, 2)
+        self._write(0x1016, 1, HOST << 16 | PATIENCE_MS, 4)
+        self._write(cia402.ABORT_CONNECTION, 0, 1, 2)
+        self._map(0x1400, 0x1600, 0x200 + self.node,
+                  (cia402.CONTROLWORD << 16 | 16, cia402.TARGET_TORQUE << 16 | 16))  # fmt: skip
+        self._write(0x1400, 5, PATIENCE_MS, 2)
+        self._map(0x1800, 0x1A00, 0x180 + self.node,
+                  (cia402.STATUSWORD << 16 | 16, cia402.POSITION << 16 | 32,
+                   cia402.ACTUAL_TORQUE << 16 | 16))  # fmt: skip
+        self._map(0x1801, 0x1A01, 0x280 + self.node, (cia402.INPUTS << 16 | 32,), AT_CHANGE)
+        self._write(0x1801, 5, INPUTS_MS, 2)
+        self._write(cia402.MODE, 0, cia402.CYCLIC_TORQUE, 1)
+        rated = int.from_bytes(sdo.upload(cia402.RATED_TORQUE, 0), 'little')
+        if rated == 0:
+            raise OSError('its rated torque (0x6076) is zero')
+        self._remote.nmt.send_command(0x01)
+        return rated / 1000
+
+    def _map(
+        self, about: int, mapping: int, cob: int, objects: tuple[int, ...], when: int = AT_SYNC
+    ) -> None:
+        """Have a PDO hold these objects."""
+        self._write(about, 1, cob | OFF, 4)
+        self._write(about, 2, when, 1)
+        self._write(mapping, 0, 0, 1)
+        for k, entry in enumerate(objects, 1):
+            self._write(mapping, k, entry, 4)
+        self._write(mapping, 0, len(objects), 1)
+        self._write(about, 1, cob, 4)
+
+    def _write(self, index: int, sub: int, value: int, size: int) -> None:
+        self._remote.sdo.download(index, sub, value.to_bytes(size, 'little'))
+
+    # What comes in, in the thread of the bus
+
+    def _on_answer(self, cob: int, data: bytearray, timestamp: float) -> None:
+        if len(data) != ANSWER.size:
+            return
+        word, counts, torque = ANSWER.unpack(data)
+        try:
+            state = cia402.state_of(word)
+        except ValueError:
+            return
+        with self._lock:
+            answer = Answer(self._sync_ns, state, counts, self.scale.torque(torque), self._inputs)
+            self.answers.append(answer)
+            self._last, self._answered = answer, time.monotonic()
+        self._heard.set()
+
+    def _on_inputs(self, cob: int, data: bytearray, timestamp: float) -> None:
+        if len(data) == 4:
+            with self._lock:
+                self._inputs = int.from_bytes(data, 'little')
+
+    def _on_emergency(self, error: canopen.emcy.EmcyError) -> None:
+        with self._lock:
+            self._emergency = cia402.error_text(error.code) if error.code else ''
+
+    # What goes out
+
+    @property
+    def state(self) -> State | None:
+        """Of the drive; None while it is silent."""
+        with self._lock:
+            fresh = time.monotonic() - self._answered < SILENCE_S
+            return self._last.state if fresh and self._last else None
+
+    @property
+    def enabled(self) -> bool:
+        """Whether torque acts."""
+        return self.wanted and self.state == State.ENABLED
+
+    def enable(self) -> None:
+        """Lead the drive to operation enabled, out of a fault as well; for a person to ask."""
+        with self._lock:
+            self._emergency = ''
+        self.wanted, self.reason, self._reset = True, '', True
+        self._enabling_since = time.monotonic()
+
+    def disable(self, reason: str) -> None:
+        """Take the torque off, until `enable`."""
+        if self.wanted or not self.reason:
+            self.reason = reason
+        self.wanted = False
+
+    def cycle(self, torque: float) -> None:
+        """One cycle: command, SYNC, heartbeat.
+
+        Args:
+            torque: At the joint in N m; only while `enabled` it goes out.
+
+        Raises:
+            DriveError: The bus is gone.
+        """
+        state = self.state
+        self._watch(state)
+        target = self.scale.target(torque) if self.wanted and state == State.ENABLED else 0
+        self._heard.clear()
+        try:
+            self._network.send_message(0x200 + self.node, COMMAND.pack(self._word(state), target))
+            with self._lock:
+                self._sync_ns = self._wall_ns()
+            self._network.send_message(SYNC, b'')
+            self._network.send_message(HEARTBEAT + HOST, bytes([OPERATIONAL]))
+        except (can.CanError, OSError) as error:
+            self.disable(f'the bus is gone: {error}')
+            raise DriveError(f'drive {self.node}: {error}') from error
+
+    def await_answer(self, timeout_s: float) -> None:
+        """Wait until the drive has answered the last SYNC, or so long."""
+        self._heard.wait(timeout_s)
+
+    def _word(self, state: State | None) -> int:
+        if not self.wanted or state is None:
+            return cia402.DISABLE_VOLTAGE
+        if state == State.ENABLED:
+            self._reset = False  # a fault from now on waits for a person
+        if state == State.FAULT and self._reset:
+            self._reset = False  # one rising edge
+            return cia402.FAULT_RESET
+        return cia402.word_to_enable(state)
+
+    def _watch(self, state: State | None) -> None:
+        """Give up what is no longer as it should be."""
+        if not self.wanted:
+            return
+        if state is None and time.monotonic() - self._enabling_since > SILENCE_S:
+            self.disable('the drive is silent')
+        elif state in FAULTS and not self._reset and self._past_start:
+            with self._lock:
+                self.disable(self._emergency or state.value)
+        elif state == State.QUICK_STOP:
+            self.disable(state.value)
+
+    @property
+    def _past_start(self) -> bool:
+        # A reset takes the drive some cycles.
+        return time.monotonic() - self._enabling_since > 0.1
+
+    def close(self) -> None:
+        """Leave the drive without torque, and the bus."""
+        try:
+            if self._network.bus is not None:
+                self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
+                self._network.send_message(SYNC, b'')
+        except (can.CanError, OSError):
+            pass  # the drive's own watch sees to it
+        self._network.disconnect()
+
+
+def told(bus: dict) -> str:
+    """A bus in words."""
+    return f'{bus.get("interface")}:{bus.get("channel")}'

@@ -1,0 +1,240 @@
+"""The compass gait that is not there, behind an IMU and a drive that are not there either.
+
+    python -m cg_hardware.emulators.robot FOLDER [--model NAME] [--stance inner] [--lean 0.05]
+
+makes FOLDER/imu, the serial line of a 3DM-GX3-25, and FOLDER/can, a serial CAN adapter with a
+CiA 402 drive behind it. A person holds the robot until its drive is enabled; from then on it
+stands or falls by what the drive is told. Time is this process's own, and runs as fast as real.
+
+Faults are asked for on standard input, one a line, with a number where one is needed:
+
+    imu_silent  imu_back  imu_frozen  imu_garbage N  imu_cut N  imu_unplug  imu_plug
+    can_silent  can_back  can_garbage N  drive_fault CODE  drive_off  drive_on
+    usb_ms T (the IMU's bytes go out every T ms)  can_jitter_ms T  push P (N s at the hip)
+    let_go  hold  report
+
+`report` prints one line of JSON: the time, whether the drive is enabled, its torque and every
+change of it since the last report, the lean of the stance leg, and how far it went.
+"""
+
+import argparse
+import json
+import math
+import os
+import random
+import select
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from cg_description.paths import model_path
+from cg_dynamics.errors import SimulationError
+from cg_dynamics.model import Model
+from cg_dynamics.plant import Plant
+from cg_dynamics.rig import STANCES, Setup
+from cg_hardware.emulators.cia402_device import Cia402Device
+from cg_hardware.emulators.gx3_device import Gx3Device
+from cg_hardware.emulators.wires import Pty, SerialCan
+
+STEP = 0.002  # s of the body, and of its sensors
+BEHIND = 0.5  # s that the emulation may be late before it lets time go
+DRIFT = 40e-6  # of the IMU's quartz
+SHELL = 12_345  # counts at which the encoder wakes up
+FOOT_BITS = {'inner': 1 << 16, 'outer': 1 << 17}  # of the drive's inputs, a foot switch each
+GIMBAL = (0.012, -0.7)  # rad: roll and yaw of an IMU that is mounted as people mount things
+
+
+class EmulatedRobot:
+    """Body and devices.
+
+    Args:
+        folder: Gets the ends of the wires.
+        model: Of the body.
+        stance: Leg that stands.
+        lean: Of both legs at the start, rad.
+        seed: Of the sensors' noise, of jitter and garbage.
+    """
+
+    def __init__(self, folder: Path, model: Model, stance: str, lean: float, seed: int = 1):
+        self._plant = Plant(
+            model, Setup(stance=stance), np.array([lean, lean, 0.0, 0.0]), STEP, seed
+        )
+        resolution = model.sensors['hip_angle'].get('resolution')
+        self._count = resolution.value if resolution else 2 * math.pi / 20_000
+        self._random = random.Random(seed)
+        self._folder = folder
+        self.imu_line, self.can_line = Pty(folder / 'imu'), Pty(folder / 'can')
+        self._can = SerialCan(self.can_line)
+        self.imu = Gx3Device(
+            drift=DRIFT, timer=4_294_000_000
+        )  # wraps within the first half minute
+        self.drive = Cia402Device()
+        self._greeted = False
+        self._held = True
+        self._silent: set[str] = set()
+        self._usb_s = self._jitter_s = 0.0
+        self._waiting = b''
+        self._flushed = 0.0
+        self._late_frames: list[tuple[float, tuple[int, bytes]]] = []
+        self._told = 0
+        self.farthest = 0.0
+        self.ticks = 0
+
+    @property
+    def now(self) -> float:
+        """Time of the body in s."""
+        return self.ticks * STEP
+
+    def move(self) -> None:
+        """Move the body on by STEP, and take the IMU's sample that is due."""
+        if self._held and self.drive.state == 'operation enabled':
+            self._held = False
+        if not self._held:
+            self._plant.latch([self.drive.acting * self.drive.rated * 1e-6])
+            try:
+                self._plant.advance()
+            except SimulationError:
+                self._held = True  # it lies on the floor
+            lean = self._plant.state[STANCES.index(self._plant.stance)]
+            self.farthest = max(self.farthest, abs(float(lean)))
+        self.ticks += 1
+        measured = self._plant.measure()
+        outputs = measured.outputs
+        self.drive.counts = SHELL + round(outputs['hip_angle'] / self._count)
+        self.drive.inputs = sum(
+            FOOT_BITS[leg] for leg, force in measured.contact.items() if force > 0.0
+        )
+        if self.ticks % max(1, round(self.imu.period / STEP)) == 0:
+            rates = (0.0, outputs['imu_rate'], 0.0)
+            roll, yaw = GIMBAL
+            self._waiting += self.imu.sample(self.now, roll, outputs['imu_angle'], yaw, rates)
+
+    def serve(self, now: float) -> None:
+        """Answer what came in on the wires, and send what is due.
+
+        Args:
+            now: Time in s since the start.
+        """
+        self._serve_can(now)
+        self._serve_imu(now)
+
+    def _serve_can(self, now: float) -> None:
+        frames = self._can.receive()
+        answers = [f for cob, data in frames for f in self.drive.receive(cob, data, now)]
+        if self._can.opened and not self._greeted:
+            self._greeted = True
+            answers += self.drive.power_on()
+        answers += self.drive.step(now)
+        if 'can' in self._silent:
+            return
+        for frame in answers:
+            late = self._random.uniform(0.0, self._jitter_s) if self._jitter_s else 0.0
+            self._late_frames.append((now + late, frame))
+        due = [frame for at, frame in self._late_frames if at <= now]
+        self._late_frames = [(at, frame) for at, frame in self._late_frames if at > now]
+        self._can.send(due)
+
+    def _serve_imu(self, now: float) -> None:
+        if self.imu_line is None:
+            return
+        self._waiting += self.imu.receive(self.imu_line.read(), now)
+        if 'imu' in self._silent:
+            self._waiting = b''
+        elif self._waiting and now - self._flushed >= self._usb_s:
+            self._flushed = now
+            self.imu_line.write(self._waiting)
+            self._waiting = b''
+
+    def ask(self, line: str) -> str:
+        """Carry out a line of standard input; what to print, if anything."""
+        word, *rest = line.split()
+        number = float(int(rest[0], 0) if rest[0].startswith('0x') else rest[0]) if rest else 0.0
+        if word == 'report':
+            return self._report()
+        device, _, what = word.partition('_')
+        if what in ('silent', 'back'):
+            (self._silent.add if what == 'silent' else self._silent.discard)(device)
+        elif word == 'imu_frozen':
+            self.imu.frozen = not self.imu.frozen
+        elif word == 'imu_garbage':
+            self._waiting += self._random.randbytes(int(number))
+        elif word == 'imu_cut':
+            self._waiting = self._waiting[int(number) :]
+        elif word == 'imu_unplug':
+            self.imu_line.close()
+            self.imu_line = None
+        elif word == 'imu_plug':
+            self.imu_line = Pty(self._folder / 'imu')
+            self.imu = Gx3Device(drift=DRIFT, timer=self._random.randrange(1 << 32))
+        elif word == 'can_garbage':
+            self.can_line.write(self._random.randbytes(int(number)))
+        elif word == 'drive_fault':
+            self._can.send(self.drive.fault(int(number), self.now))
+        elif word == 'drive_off':
+            self.drive.dead = True
+            self.drive.log.append((self.now, 0))
+            self.drive.acting = 0
+        elif word == 'drive_on':
+            self.drive = Cia402Device()
+            self._greeted = False
+        elif word == 'usb_ms':
+            self._usb_s = number / 1000
+        elif word == 'can_jitter_ms':
+            self._jitter_s = number / 1000
+        elif word == 'push':
+            self._plant.push(number)
+        elif word in ('hold', 'let_go'):
+            self._held = word == 'hold'
+        else:
+            return json.dumps({'error': f'{line.strip()!r} is nothing that can be asked for'})
+        return ''
+
+    def _report(self) -> str:
+        changes, self._told = self.drive.log[self._told :], len(self.drive.log)
+        lean = self._plant.state[STANCES.index(self._plant.stance)]
+        return json.dumps({
+            'time': self.now, 'state': self.drive.state, 'acting': self.drive.acting,
+            'changes': changes, 'lean': float(lean), 'farthest': self.farthest,
+            'held': self._held,
+        })  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('folder', type=Path)
+    parser.add_argument('--model', default='compass_gait_flexible')
+    parser.add_argument('--stance', choices=STANCES, default='inner')
+    parser.add_argument('--lean', type=float, default=0.05, help='of both legs, rad')
+    parser.add_argument('--seed', type=int, default=1)
+    options = parser.parse_args()
+    model = Model.load(model_path(options.model))
+    robot = EmulatedRobot(options.folder, model, options.stance, options.lean, options.seed)
+    os.set_blocking(sys.stdin.fileno(), False)
+    print('ready', flush=True)
+    begun, words = time.monotonic(), ''
+    while True:
+        now = time.monotonic() - begun
+        if now - robot.now > BEHIND:
+            begun += now - robot.now  # a host that slept: time goes on from here
+        if now >= robot.now:
+            robot.move()
+            robot.serve(now)
+            continue
+        wires = [wire for wire in (robot.can_line, robot.imu_line) if wire is not None]
+        heard, _, _ = select.select([*wires, sys.stdin], [], [], robot.now - now)
+        robot.serve(time.monotonic() - begun)
+        if sys.stdin not in heard:
+            continue
+        said = os.read(sys.stdin.fileno(), 65536)
+        if not said:
+            return 0
+        *lines, words = (words + said.decode()).split('\n')
+        for line in filter(str.strip, lines):
+            if answer := robot.ask(line):
+                print(answer, flush=True)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""The IMU: its bytes, its clock, how it is mounted. No ROS."""
