@@ -144,9 +144,9 @@ class Gatherer:
 
     def _add_apart(self, stamp_ns: int, outputs: dict[str, float]) -> None:
         """A reading of a device that has stamps of its own."""
-        if 'imu_angle' not in outputs or self._last_ns is not None and stamp_ns <= self._last_ns:
+        if 'imu_angle' not in outputs or (self._last_ns is not None and stamp_ns <= self._last_ns):
             return
-        if 'hip_angle' in outputs or self._encoder is not None and self._encoder[0] == stamp_ns:
+        if 'hip_angle' in outputs or (self._encoder is not None and self._encoder[0] == stamp_ns):
             self._alone = 0  # they meet after all
         self._waiting.clear()
         self._last_ns, late = stamp_ns, {}

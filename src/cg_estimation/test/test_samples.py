@@ -97,3 +97,48 @@ def test_the_leg_that_lands_stands_from_its_first_touch_on():
         gatherer.add_torque(k * T, 0.0)
     # Both feet down tell nothing new.
     assert heard == ['inner', 'inner', 'outer', None, 'outer', 'outer']
+
+
+def apart(gatherer, k, lag=0):
+    """An IMU and a drive on clocks of their own; the drive's sample is `lag` ns older."""
+    gatherer.add(k * T - lag, {'hip_angle': float(k)})
+    gatherer.add(k * T, {'imu_angle': 0.1 * k, 'imu_rate': 0.0})
+    return list(gatherer.due())
+
+
+def test_stamps_that_never_meet_are_not_waited_for():
+    gatherer = Gatherer(contacts=False)
+    given = [apart(gatherer, k, lag=700_000) for k in range(1, 40)]
+    assert gatherer.apart
+    # Until that is known two IMU samples are waited for each; then each is a measurement at once.
+    for k, found in enumerate(given[-10:], 30):
+        (measurement,) = found
+        assert measurement.stamp_ns == k * T
+        assert measurement.outputs == {'imu_angle': 0.1 * k, 'imu_rate': 0.0, 'hip_angle': k}
+        assert measurement.late == {'hip_angle': 7e-4}
+
+
+def test_an_encoder_that_is_too_old_is_left_out_and_one_that_meets_again_is_waited_for():
+    gatherer = Gatherer(contacts=False)
+    for k in range(1, 40):
+        apart(gatherer, k, lag=700_000)
+    gatherer.add(47 * T, {'imu_angle': 0.0})
+    (measurement,) = gatherer.due()
+    assert measurement.outputs == {'imu_angle': 0.0}
+    apart(gatherer, 50)
+    assert not gatherer.apart
+
+
+def test_a_landing_between_two_measurements_is_not_lost():
+    gatherer = Gatherer()
+    for k in range(1, 40):
+        for leg, on in (('inner', True), ('outer', False)):
+            gatherer.add_contact(k * T - 1, leg, on)
+        apart(gatherer, k, lag=700_000)
+    assert gatherer.apart
+    gatherer.add_contact(40 * T - 3, 'outer', True)
+    gatherer.add_contact(40 * T - 2, 'inner', True)  # still down: nothing new
+    (measurement,) = apart(gatherer, 40, lag=700_000)
+    assert measurement.stance == 'outer'
+    gatherer.add_contact(41 * T - 2, 'inner', False)
+    assert apart(gatherer, 41, lag=700_000)[0].stance == 'outer'

@@ -1,9 +1,9 @@
 """ROS node of the motor drive: CiA 402, cyclic synchronous torque, over CAN. Its words: drive/.
 
-Torque acts only while a person has called ~/enable and nothing has gone wrong since: a drive fault,
-an emergency object, a silent drive, a bus that is gone, a command that is no number, names another
-joint, or is older than `stale_after` (safety.py) make it zero. After the first four only ~/enable
-brings it back, after a bad command the next good one.
+Torque acts only while a person has called ~/enable and nothing has gone wrong since. A fault of
+the drive, an emergency object, a silent drive, a bus that is gone, a command that is no number,
+names another joint, or is older than `stale_after` (safety.py) make it zero. After the first four
+only ~/enable brings it back, after a bad command the next good one.
 
 The bus is opened by python-can, so `interface` and `channel` are what that takes: socketcan and
 can0, slcan and /dev/ttyACM1, or any adapter that it knows.

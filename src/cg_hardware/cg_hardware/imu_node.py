@@ -67,7 +67,7 @@ class ImuSettings(Settings):
     )
     latency: float = setting(
         0.0,
-        'from the instant of a sample to its first byte on the line, by the data sheet or measured',
+        'from the instant of a sample to its first byte on the line, by data sheet or measured',
         unit='s', minimum=0.0, maximum=0.1,
     )  # fmt: skip
     zero_file: str = setting(
@@ -256,7 +256,8 @@ class ImuNode(Node):
             status.level, status.message = DiagnosticStatus.ERROR, self.problem
         publish_status(self.diagnostics, status, {
             'samples_per_s': self._published, 'repeated': self._repeated, 'bad': bad,
-            'bytes_skipped': self.parser.skipped, 'clock_drift_ppm': f'{1e6 * self.clock.drift:.1f}',
+            'bytes_skipped': self.parser.skipped,
+            'clock_drift_ppm': f'{1e6 * self.clock.drift:.1f}',
             'clock_jumps': self.clock.jumps, 'zero_rad': f'{self.mounting.zero:.6f}',
         })  # fmt: skip
         self._published = self._repeated = 0

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import can
 import canopen
+from canopen.sdo.exceptions import SdoError
 
 from cg_hardware.drive import cia402
 from cg_hardware.drive.cia402 import State
@@ -125,7 +126,13 @@ class CanDrive:
         self._open(bus)
         try:
             rated = self._set_up() * gear
-        except (canopen.SdoError, can.CanError, OSError, struct.error) as error:
+        except (
+            canopen.sdo.SdoCommunicationError,
+            canopen.sdo.SdoAbortedError,
+            can.CanError,
+            OSError,
+            struct.error,
+        ) as error:
             self.close()
             raise DriveError(f'drive {node} on {told(bus)}: {error}') from error
         self.scale = Scale(rated, sign)

@@ -63,7 +63,8 @@ class Cia402Device:
         self.state = 'switch on disabled'
         self._word = 0
         self._pending: bytes | None = None
-        self._host_seen = self._command_seen = None
+        self._host_seen: float | None = None
+        self._command_seen: float | None = None
         self._beaten = -1.0
         self._inputs_sent = -1.0, -1
         self.dead = False  # power off: it says and does nothing

@@ -65,7 +65,8 @@ class EmulatedRobot:
         self._count = resolution.value if resolution else 2 * math.pi / 20_000
         self._random = random.Random(seed)
         self._folder = folder
-        self.imu_line, self.can_line = Pty(folder / 'imu'), Pty(folder / 'can')
+        self.imu_line: Pty | None = Pty(folder / 'imu')
+        self.can_line = Pty(folder / 'can')
         self._can = SerialCan(self.can_line)
         self.imu = Gx3Device(
             drift=DRIFT, timer=4_294_000_000
@@ -92,7 +93,7 @@ class EmulatedRobot:
         if self._held and self.drive.state == 'operation enabled':
             self._held = False
         if not self._held:
-            self._plant.latch([self.drive.acting * self.drive.rated * 1e-6])
+            self._plant.latch(np.array([self.drive.acting * self.drive.rated * 1e-6]))
             try:
                 self._plant.advance()
             except SimulationError:
@@ -162,7 +163,7 @@ class EmulatedRobot:
             self._waiting += self._random.randbytes(int(number))
         elif word == 'imu_cut':
             self._waiting = self._waiting[int(number) :]
-        elif word == 'imu_unplug':
+        elif word == 'imu_unplug' and self.imu_line is not None:
             self.imu_line.close()
             self.imu_line = None
         elif word == 'imu_plug':
@@ -202,6 +203,7 @@ class EmulatedRobot:
 
 
 def main() -> int:
+    """Entry point of `python -m cg_hardware.emulators.robot`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('folder', type=Path)
     parser.add_argument('--model', default='compass_gait_flexible')
