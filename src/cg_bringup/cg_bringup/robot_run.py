@@ -10,6 +10,10 @@ from cg_bringup.runs import NodeOf
 from cg_interfaces import topics
 
 RATE_HZ = 500.0
+STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the last command
+MISSING = 0.1  # s without requests after which a person must look; a node that comes up takes 30
+BLIND = 0.02  # s without the encoder
+FALLEN = 0.6  # rad of the stance leg
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,8 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
     model = {'model_file': options.model, 'sample_rate_hz': RATE_HZ}
     return {
         'drive': NodeOf('cg_hardware', 'drive_node', gate | {
-            'interface': options.interface, 'channel': options.channel, 'node_id': options.drive,
-            'sign': options.drive_sign, 'gear': options.gear,
+            'stale_after': STALE, 'interface': options.interface, 'channel': options.channel,
+            'node_id': options.drive, 'sign': options.drive_sign, 'gear': options.gear,
             'counts_per_turn': options.counts_per_turn,
         }),
         'imu': NodeOf('cg_hardware', 'imu_node', {
@@ -66,6 +70,10 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
         'balance': NodeOf(
             'cg_control', 'balance_node', model, ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),)
         ),
-        'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', gate),
-        'observer': NodeOf('cg_estimation', 'observer_node', model | {'epsilon': options.epsilon}),
+        'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', gate | {
+            'arming': True, 'fall_angle': FALLEN, 'stale_after': MISSING,
+        }),
+        'observer': NodeOf('cg_estimation', 'observer_node', model | {
+            'epsilon': options.epsilon, 'longest_blind': BLIND,
+        }),
     }  # fmt: skip

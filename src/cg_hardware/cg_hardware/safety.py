@@ -65,11 +65,13 @@ class Judgement:
         torque: In N m, one per joint.
         doubt: Empty if the request passes as it is.
         refused: The request changes nothing, and no answer to it may go on.
+        unfit: It is no torque at all, or nobody knows whose it is; not only too large.
     """
 
     torque: tuple[float, ...]
     doubt: str = ''
     refused: bool = False
+    unfit: bool = False
 
 
 def judge(request: Sequence[float], joints: Sequence[str], limit: float) -> Judgement:
@@ -82,10 +84,14 @@ def judge(request: Sequence[float], joints: Sequence[str], limit: float) -> Judg
     """
     zero = (0.0,) * len(joints)
     if len(request) != len(joints):
-        return Judgement(zero, f'{len(request)} torques for the joints {", ".join(joints)}')
+        return Judgement(
+            zero, f'{len(request)} torques for the joints {", ".join(joints)}', unfit=True
+        )
     for joint, torque in zip(joints, request, strict=True):
         if not math.isfinite(torque):
-            return Judgement(zero, f'torque of {joint} is {torque}; a finite number is needed')
+            return Judgement(
+                zero, f'torque of {joint} is {torque}; a finite number is needed', unfit=True
+            )
     limited = tuple(min(max(float(torque), -limit), limit) for torque in request)
     for joint, torque, held in zip(joints, request, limited, strict=True):
         if torque != held:
@@ -142,7 +148,7 @@ class TorqueGate:
         ahead = stamp_ns - measured_ns
         if self.rivalry:
             self.drop(self.rivalry)
-            return self._held
+            return Judgement(self._zero, self.rivalry, unfit=True)
         if ahead > self.settings.sample_ns:
             return Judgement(
                 self._held.torque,

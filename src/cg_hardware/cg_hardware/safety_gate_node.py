@@ -11,21 +11,33 @@ sent until they come back. That zero carries the stamp of the last request, so t
 was held up does not take it for one from the future, and a machine in lock-step not for an answer.
 The hardware has a watchdog of its own behind the gate.
 
-in    /torque_request, /imu, or /joint_states of a pendulum
-out   /torque_command, /diagnostics
+It also keeps the stage of the robot (lifecycle.py) on /robot_state, one line for people: torque
+passes while the robot is armed or active. With `arming`, as robot.launch.py has it, a person must
+call ~/arm, and after a fault ~/reset first. ~/stop, or true on /emergency_stop, is the emergency
+stop: torque zero until ~/reset.
+
+in    /torque_request, /emergency_stop, /imu, or /joint_states of a pendulum; with `arming`
+      /applied_torque; with `fall_angle` /state
+out   /torque_command, /robot_state, /diagnostics
 """
 
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Bool, String
+from std_srvs.srv import Trigger
 
+from cg_hardware.lifecycle import Lifecycle, Signs, Stage
 from cg_hardware.safety import GateSettings, TorqueGate
 from cg_hardware.sensor_publishers import torques_of
 from cg_interfaces import channels, topics
 from cg_interfaces.ros import (
+    LATCHED_QOS,
     SENSOR_QOS,
     DeclaredSettings,
     Throttled,
@@ -35,12 +47,21 @@ from cg_interfaces.ros import (
 )
 from cg_interfaces.settings import setting
 
+SILENCE = 0.1  # s after which a device counts as silent
+
 
 @dataclass(frozen=True)
 class GateNodeSettings(GateSettings):
     """Parameters of the gate node."""
 
     mechanism: str = setting('compass_gait', 'mechanism whose joints are guarded')
+    arming: bool = setting(
+        False, 'a person must call ~/arm before torque passes, and after faults'
+    )
+    fall_angle: float = setting(
+        0.0, 'lean of the stance leg at which the robot has fallen; 0: it never has', unit='rad',
+        minimum=0.0,
+    )  # fmt: skip
 
 
 class SafetyGateNode(Node):
@@ -67,6 +88,22 @@ class SafetyGateNode(Node):
         )
         self.message = JointState(name=list(self.joints))
         self.message.header.frame_id = channels.mechanism(mechanism).torque.frame_id
+        settings = self.declared.values
+        self.lifecycle = Lifecycle(settings.arming, settings.fall_angle)
+        self.stage = self.create_publisher(String, topics.ROBOT_STATE, LATCHED_QOS)
+        self.create_subscription(Bool, topics.EMERGENCY_STOP, self.on_emergency_stop, 10)
+        for name in ('arm', 'disarm', 'reset', 'stop'):
+            self.create_service(Trigger, f'~/{name}', partial(self.on_person, name))
+        self._heard = {'imu': -math.inf}  # device -> when, on the monotonic clock, s
+        if settings.arming:
+            self._heard['drive'] = -math.inf
+            self.create_subscription(
+                JointState, topics.APPLIED_TORQUE, self.on_applied, SENSOR_QOS
+            )
+        self._lean = math.nan
+        if settings.fall_angle:
+            self.create_subscription(JointState, topics.STATE, self.on_state, SENSOR_QOS)
+        self._said = ''
         self._measured_ns: int | None = None
         self._stale = True
         self.doubts = 0  # since the node started
@@ -77,6 +114,62 @@ class SafetyGateNode(Node):
     def on_measurement(self, message: Imu | JointState) -> None:
         """Note how far the clock of the machine is."""
         self._measured_ns = to_nanoseconds(message.header.stamp)
+        self._heard['imu'] = time.monotonic()
+
+    def on_applied(self, message: JointState) -> None:
+        """The drive is there."""
+        self._heard['drive'] = time.monotonic()
+
+    def on_state(self, message: JointState) -> None:
+        """Note how far the stance leg leans."""
+        leg = message.header.frame_id.removesuffix('_foot')
+        if leg in message.name and len(message.position) == len(message.name):
+            self._lean = message.position[message.name.index(leg)]
+
+    def on_emergency_stop(self, message: Bool) -> None:
+        """Somebody pressed it. Letting it go changes nothing: ~/reset does."""
+        if message.data:
+            self._stop()
+
+    def on_person(
+        self, what: str, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """A person arms, disarms, resets, or stops the robot."""
+        problem = self._stop() if what == 'stop' else getattr(self.lifecycle, what)()
+        response.success, response.message = not problem, problem or self.lifecycle.line
+        self._enforce()
+        return response
+
+    def _stop(self) -> str:
+        self.lifecycle.stop()
+        self._enforce()
+        return ''
+
+    def _see(self, doubt: str = '') -> None:
+        """Bring the stage up to date."""
+        now = time.monotonic()
+        silent = ()
+        if self.declared.values.arming:
+            silent = tuple(name for name, at in self._heard.items() if now - at > SILENCE)
+        self.lifecycle.see(
+            Signs(silent=silent, lean=self._lean, requests=not self._stale, doubt=doubt)
+        )
+        self._enforce()
+
+    def _enforce(self) -> None:
+        """No torque in a stage that lets none pass; say the stage when it changes."""
+        if not self.lifecycle.passes:
+            self.gate.drop(self.lifecycle.line)
+            if not self._stale:
+                self._stale = True
+                self._send((0.0,) * len(self.joints))
+        if self.lifecycle.line != self._said:
+            self._said = self.lifecycle.line
+            self.stage.publish(String(data=self._said))
+            log = self.get_logger()
+            fault = self.lifecycle.stage == Stage.FAULT
+            # Of one call each, as rclpy wants it.
+            log.error(self._said) if fault else log.info(self._said)
 
     def _measured(self, stamp_ns: int) -> int:
         """Stamp of the last measurement.
@@ -93,19 +186,26 @@ class SafetyGateNode(Node):
         self.gate.settings = self.declared.values
         self.gate.publishers = self.requests.get_publisher_count()
         now, stamp_ns = time.monotonic_ns(), to_nanoseconds(request.header.stamp)
+        if not self.lifecycle.passes:
+            # An answer all the same: a machine in lock-step waits for it.
+            self.message.header.stamp = request.header.stamp
+            self._send((0.0,) * len(self.joints))
+            return
         try:
             torques = torques_of(request, self.joints)
             judgement = self.gate.offer(torques, stamp_ns, now, self._measured(stamp_ns))
         except ValueError as error:
             self.gate.drop(str(error))
-            judgement = self.gate.torque(now)
+            judgement = replace(self.gate.torque(now), unfit=True)
         if judgement.doubt:
             self._doubt(judgement.doubt)
         if judgement.refused:
             return
-        self._stale = False
         self.message.header.stamp = request.header.stamp
+        self._stale = False
         self._send(self.gate.torque(now).torque)
+        if judgement.unfit:
+            self._see(judgement.doubt)
 
     def poll(self) -> float:
         """Send zero torque while requests are missing."""
@@ -116,6 +216,7 @@ class SafetyGateNode(Node):
             self._stale = True
             self._doubt(judgement.doubt)
             self._send(judgement.torque)
+        self._see()
         if now / 1e9 > self._next_diagnosis:
             self._next_diagnosis = now / 1e9 + 1.0
             self._publish_diagnostics()
@@ -133,7 +234,9 @@ class SafetyGateNode(Node):
         status = DiagnosticStatus(name='safety_gate', hardware_id='torque path')
         news = self.doubts - self._told
         status.level = DiagnosticStatus.WARN if news else DiagnosticStatus.OK
-        status.message = 'no requests' if self._stale else 'passing'
+        status.message = self.lifecycle.line
+        if self.lifecycle.stage == Stage.FAULT:
+            status.level = DiagnosticStatus.ERROR
         if self.gate.rivalry:
             status.level, status.message = DiagnosticStatus.ERROR, self.gate.rivalry
         values = {'requests_in_doubt': news, 'publishers': self.gate.publishers}

@@ -6,10 +6,10 @@ import pytest
 
 pytest.importorskip('canopen')
 
-from emulated_robot import Emulated  # noqa: E402
+from emulated_robot import Emulated
 
-from cg_hardware.drive.can_drive import CanDrive, DriveError  # noqa: E402
-from cg_hardware.drive.cia402 import State  # noqa: E402
+from cg_hardware.drive.can_drive import CanDrive, DriveError
+from cg_hardware.drive.cia402 import State
 
 pytestmark = pytest.mark.alone
 
@@ -120,7 +120,7 @@ def test_a_drive_that_falls_silent_is_given_up(robot, drive):
 
 
 def test_what_is_not_there_is_named(tmp_path, robot):
-    with pytest.raises(DriveError, match='slcan:.*nothing'):
+    with pytest.raises(DriveError, match=r'slcan:.*nothing'):
         CanDrive({'interface': 'slcan', 'channel': str(tmp_path / 'nothing')}, 1)
     with pytest.raises(DriveError, match=r'drive 5 on slcan:.*[Nn]o SDO response'):
         CanDrive(robot.bus, 5)

@@ -3,8 +3,8 @@
 import pytest
 
 from cg_hardware.drive import cia402
-from cg_hardware.drive.cia402 import State
 from cg_hardware.drive.can_drive import Scale
+from cg_hardware.drive.cia402 import State
 
 
 @pytest.mark.parametrize(

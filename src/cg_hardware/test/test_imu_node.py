@@ -139,7 +139,11 @@ def test_a_zero_is_taken_kept_and_read_again(bench, tmp_path):
 
 @pytest.mark.parametrize(
     ('text', 'said'),
-    [('zero_rad: 9.0\n', 'must be an angle'), ('[]\n', 'zero_rad must be'), ('a: [\n', 'zero.yaml')],
+    [
+        ('zero_rad: 9.0\n', 'must be an angle'),
+        ('[]\n', 'zero_rad must be'),
+        ('a: [\n', 'zero.yaml'),
+    ],
 )
 def test_a_file_that_keeps_no_zero_is_refused(tmp_path, text, said):
     file = tmp_path / 'zero.yaml'

@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import contextmanager
 
 import pytest
 
@@ -12,10 +13,12 @@ from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
+from std_msgs.msg import Bool, String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from cg_hardware.safety_gate_node import SafetyGateNode  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
-from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
 pytestmark = pytest.mark.alone
 
@@ -23,8 +26,11 @@ pytestmark = pytest.mark.alone
 class Bench:
     """A gate, and a peer that asks, measures and listens."""
 
-    def __init__(self):
-        self.gate = SafetyGateNode(parameter_overrides=[Parameter('torque_limit', value=10.0)])
+    def __init__(self, **settings):
+        self.gate = SafetyGateNode(parameter_overrides=[
+            Parameter(name, value=value)
+            for name, value in {'torque_limit': 10.0, **settings}.items()
+        ])  # fmt: skip
         self.peer = Node('peer')
         self.commands, self.reports = [], []
         self.peer.create_subscription(
@@ -35,6 +41,13 @@ class Bench:
         )
         self.publisher = self.peer.create_publisher(JointState, '/torque_request', SENSOR_QOS)
         self.imu = self.peer.create_publisher(Imu, '/imu', SENSOR_QOS)
+        self.applied = self.peer.create_publisher(JointState, '/applied_torque', SENSOR_QOS)
+        self.state = self.peer.create_publisher(JointState, '/state', SENSOR_QOS)
+        self.button = self.peer.create_publisher(Bool, '/emergency_stop', 10)
+        self.stages = []
+        self.peer.create_subscription(
+            String, '/robot_state', lambda m: self.stages.append(m.data), LATCHED_QOS
+        )
         self.executor = EventsExecutor()
         for node in (self.gate, self.peer):
             self.executor.add_node(node)
@@ -59,6 +72,36 @@ class Bench:
         self.imu.publish(message)
         self.until(lambda: self.gate._measured_ns == nanoseconds)
 
+    def call(self, what):
+        """A person asks; the answer."""
+        client = self.peer.create_client(Trigger, f'/safety_gate/{what}')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+    def live(self, seconds, torque=2.0, lean=0.0):
+        """So long a robot whose controller asks for a torque; the last one that came through."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            now = time.time_ns()
+            imu, applied, state = Imu(), JointState(name=['hip'], effort=[0.0]), JointState()
+            state.header.frame_id, state.name, state.position = (
+                'outer_foot',
+                ['inner', 'outer'],
+                [9.0, lean],
+            )
+            for publisher, message in (
+                (self.imu, imu), (self.applied, applied), (self.state, state),
+                (self.publisher, request(torque, now)),
+            ):  # fmt: skip
+                message.header.stamp = to_stamp(now)
+                publisher.publish(message)
+            for _ in range(4):
+                self.executor.spin_once(timeout_sec=0.001)
+            self.gate.poll()
+        return self.commands[-1].effort[0]
+
     def __iter__(self):
         return iter((self.gate, self.publisher, self.commands, self.until))
 
@@ -68,14 +111,27 @@ class Bench:
             node.destroy_node()
 
 
-@pytest.fixture
-def bench():
+@contextmanager
+def running(**settings):
     with own_domain():
         rclpy.init()
-        bench = Bench()
+        bench = Bench(**settings)
         yield bench
         bench.close()
         rclpy.try_shutdown()
+
+
+@pytest.fixture
+def bench():
+    with running() as bench:
+        yield bench
+
+
+@pytest.fixture
+def robot():
+    """A gate that a person arms."""
+    with running(arming=True, fall_angle=0.6) as bench:
+        yield bench
 
 
 def request(torque, nanoseconds):
@@ -170,3 +226,42 @@ def test_limits_can_be_changed_while_it_runs_and_nonsense_is_refused(bench):
     publisher.publish(request(2.0, 5))
     until(lambda: commands)
     assert commands[0].effort[0] == 1.0
+
+
+def test_no_torque_before_a_person_arms(robot):
+    assert robot.live(0.3) == 0.0
+    assert robot.stages[-1] == 'idle'
+    assert robot.call('arm').success
+    assert robot.live(0.3) == 2.0
+    assert robot.stages[-1] == 'active'
+    assert robot.call('disarm').success
+    assert robot.live(0.2) == 0.0
+    assert robot.stages[-1] == 'idle: disarmed'
+
+
+@pytest.mark.parametrize(
+    ('what', 'said'),
+    [
+        (lambda r: r.button.publish(Bool(data=True)), 'fault: emergency stop'),
+        (lambda r: r.call('stop'), 'fault: emergency stop'),
+        (lambda r: r.live(0.1, torque=math.nan), 'fault: torque of hip is nan'),
+        (lambda r: r.live(0.1, lean=0.7), 'fault: the robot has fallen'),
+        (lambda r: r.until(lambda: r.stages[-1] != 'active'), 'fault: torque requests stopped'),
+    ],
+    ids=['button', 'stop', 'nan', 'fallen', 'silence'],
+)
+def test_a_fault_is_told_and_stays_until_a_person_resets_and_arms(robot, what, said):
+    robot.live(0.3)
+    robot.call('arm')
+    robot.live(0.3)
+    assert robot.stages[-1] == 'active'
+    what(robot)
+    robot.until(lambda: robot.stages[-1].startswith(said))
+    assert robot.live(0.3) == 0.0
+    refused = robot.call('arm')
+    assert not refused.success
+    assert 'only an idle robot can be armed' in refused.message
+    assert robot.call('reset').success
+    assert robot.live(0.2) == 0.0
+    assert robot.call('arm').success
+    assert robot.live(0.3) == 2.0

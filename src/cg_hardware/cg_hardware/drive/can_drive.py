@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import can
 import canopen
-from canopen.sdo.exceptions import SdoError
 
 from cg_hardware.drive import cia402
 from cg_hardware.drive.cia402 import State

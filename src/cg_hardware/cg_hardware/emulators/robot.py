@@ -13,8 +13,9 @@ Faults are asked for on standard input, one a line, with a number where one is n
     usb_ms T (the IMU's bytes go out every T ms)  can_jitter_ms T  push P (N s at the hip)
     let_go  hold  report
 
-`report` prints one line of JSON: the time, whether the drive is enabled, its torque and every
-change of it since the last report, the lean of the stance leg, and how far it went.
+`report` prints one line of JSON: the time, the state of the drive, its torque and every change of
+it since the last report, the lean of the stance leg, how far it went, and by how much the host held
+the emulation up since the last report (`late`, s): what was measured meanwhile says little.
 """
 
 import argparse
@@ -80,7 +81,7 @@ class EmulatedRobot:
         self._flushed = 0.0
         self._late_frames: list[tuple[float, tuple[int, bytes]]] = []
         self._told = 0
-        self.farthest = 0.0
+        self.farthest = self.late = 0.0
         self.ticks = 0
 
     @property
@@ -194,11 +195,12 @@ class EmulatedRobot:
 
     def _report(self) -> str:
         changes, self._told = self.drive.log[self._told :], len(self.drive.log)
+        late, self.late = self.late, 0.0
         lean = self._plant.state[STANCES.index(self._plant.stance)]
         return json.dumps({
             'time': self.now, 'state': self.drive.state, 'acting': self.drive.acting,
             'changes': changes, 'lean': float(lean), 'farthest': self.farthest,
-            'held': self._held,
+            'held': self._held, 'late': late,
         })  # fmt: skip
 
 
@@ -221,6 +223,7 @@ def main() -> int:
         if now - robot.now > BEHIND:
             begun += now - robot.now  # a host that slept: time goes on from here
         if now >= robot.now:
+            robot.late = max(robot.late, now - robot.now)
             robot.move()
             robot.serve(now)
             continue
