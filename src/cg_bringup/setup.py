@@ -53,6 +53,7 @@ setup(
             'balance = cg_bringup.balance_run:main',
             'rebalance = cg_bringup.rebalance_run:main',
             'recover_balance = cg_bringup.recover_run:main',
+            'robot = cg_bringup.robot_run:main',
             'walk = cg_bringup.walk_run:main',
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',

@@ -1,18 +1,33 @@
 """The nodes of a robot whose IMU and drive hang on wires: the same above them as in simulation.
 
-robot.launch.py starts them. With the devices of cg_hardware.emulators on the other ends of the
-wires the whole of it runs at a desk.
+    ros2 run cg_bringup robot --imu /dev/ttyACM0 --interface socketcan --channel can0
+    ros2 run cg_bringup robot --emulated     # at a desk, with emulated devices on the wires
+
+robot.launch.py starts the same nodes. Nothing moves before a person arms the robot.
 """
 
-from dataclasses import dataclass
+import argparse
+import contextlib
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 from cg_bringup.runs import NodeOf
+from cg_bringup.supervisor import ProcessDied, supervised
+from cg_dynamics.stop_request import Stopped
 from cg_interfaces import topics
 
 RATE_HZ = 500.0
 STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the last command
-MISSING = 0.1  # s without requests after which a person must look; a node that comes up takes 30
+MISSING = 0.1  # s without requests after which a person must look; a busy host takes 30 ms off
 BLIND = 0.02  # s without the encoder
+NEXT = (
+    'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright, parallel, '
+    'still), /safety_gate/arm, /drive/enable. /safety_gate/stop is the emergency stop'
+)
 FALLEN = 0.6  # rad of the stance leg
 
 
@@ -77,3 +92,77 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
             'epsilon': options.epsilon, 'longest_blind': BLIND,
         }),
     }  # fmt: skip
+
+
+TOLD = {
+    'imu': 'serial line of the IMU',
+    'baud': 'of it, bit/s',
+    'axis': 'angle of the IMU that is the lean: roll, pitch or yaw',
+    'imu_sign': '1, or -1 where the IMU counts a forward lean negative',
+    'zero_file': 'keeps the zero of the IMU; empty for none',
+    'interface': "python-can's name of the CAN adapter: socketcan, slcan, ...",
+    'channel': 'of the adapter',
+    'drive': 'number of the drive on the bus',
+    'drive_sign': '1, or -1 where its torque turns the joint backward',
+    'gear': 'torque at the joint per torque of the motor',
+    'counts_per_turn': 'of the encoder, per turn of the joint',
+    'torque_limit': 'N m',
+    'model': 'model of observer and controller, a file or a name; empty: nominal',
+    'epsilon': 'time constant of the observer, s',
+}
+
+
+@contextlib.contextmanager
+def emulated_devices(folder: Path) -> Iterator[None]:
+    """Emulated devices whose wires end in a folder, while the context lasts."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'cg_hardware.emulators.robot', str(folder)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        if process.stdout.readline() != 'ready\n':
+            raise OSError('the emulated devices did not start')
+        yield
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point of `ros2 run cg_bringup robot`."""
+    parser = argparse.ArgumentParser(prog='robot', description=__doc__.splitlines()[0])
+    for field in fields(RobotOptions):
+        parser.add_argument(
+            f'--{field.name.replace("_", "-")}', type=type(field.default), default=field.default,
+            help=f'{TOLD[field.name]} [{field.default}]',
+        )  # fmt: skip
+    parser.add_argument(
+        '--emulated',
+        action='store_true',
+        help='no robot is there: emulated devices on pty and CAN',
+    )
+    given = vars(parser.parse_args(args))
+    emulated = given.pop('emulated')
+    try:
+        with tempfile.TemporaryDirectory(prefix='cg_wires_') as directory:
+            if emulated:
+                wires = {name: f'{directory}/{name}' for name in ('imu', 'can')}
+                given |= {'imu': wires['imu'], 'interface': 'slcan', 'channel': wires['can']}
+            devices = emulated_devices(Path(directory)) if emulated else contextlib.nullcontext()
+            with devices, supervised(robot_nodes(RobotOptions(**given))) as supervisor:
+                print(f'robot: {NEXT}', flush=True)
+                supervisor.wait('drive')
+    except ProcessDied as error:
+        print(f'robot: {error}', file=sys.stderr)
+        return 1
+    except Stopped as stopped:
+        return stopped.status
+    except OSError as error:
+        print(f'robot: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

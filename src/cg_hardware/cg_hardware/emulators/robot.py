@@ -14,7 +14,7 @@ Faults are asked for on standard input, one a line, with a number where one is n
     let_go  hold  report
 
 `report` prints one line of JSON: the time, the state of the drive, its torque and every change of
-it since the last report, the lean of the stance leg, how far it went, and by how much the host held
+it since the last report, the lean of the stance leg, how far it went, and how long the host held
 the emulation up since the last report (`late`, s): what was measured meanwhile says little.
 """
 
