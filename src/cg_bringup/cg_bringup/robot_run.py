@@ -22,7 +22,7 @@ from cg_interfaces import topics
 
 RATE_HZ = 500.0
 STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the last command
-MISSING = 0.1  # s without requests after which a person must look; a busy host takes 30 ms off
+MISSING = 0.1  # s without requests after which a person must look; busy hosts miss 30 ms
 BLIND = 0.02  # s without the encoder
 NEXT = (
     'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright, parallel, '

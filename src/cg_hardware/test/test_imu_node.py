@@ -29,7 +29,7 @@ class Bench:
     """The node, its device, and somebody who listens."""
 
     def __init__(self, folder, **settings):
-        self.robot = Emulated(folder, '--lean', str(LEAN))
+        self.robot = Emulated(folder, '--state', *map(str, (LEAN, LEAN, 0, 0)))
         given = {'port': str(folder / 'imu'), 'zero_file': str(folder / 'zero.yaml'), **settings}
         self.node = ImuNode(parameter_overrides=[
             Parameter(name, value=value) for name, value in given.items()

@@ -14,6 +14,7 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
 
 import contextlib
 import dataclasses
+import gc
 import inspect
 import os
 import sys
@@ -250,6 +251,8 @@ def run(
         except (ValueError, OSError, ParameterException) as error:
             print(f'error: {error}', file=sys.stderr)
             return 2
+        # What stands now stays: a search for garbage among it would cost milliseconds at a time.
+        gc.freeze()
         try:
             spin(node, lambda: stop.requested)
         finally:

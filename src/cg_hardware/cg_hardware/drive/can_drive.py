@@ -32,6 +32,7 @@ OFF = 1 << 31  # bit of a COB-ID: the object is off
 AT_SYNC, AT_CHANGE = 1, 255  # when a PDO is sent
 INPUTS_MS = 50  # in which the inputs come again, changed or not
 PRESENT = 402  # low half of the device type
+LATEST_NS = 2_800_000  # ns that an answer takes at most; an older SYNC's is lost
 SILENCE_S = 0.015  # s without an answer after which the drive counts as lost
 PATIENCE_MS = 18  # for which the drive waits for the host's heartbeat and torque: 20 less a cycle
 DRIVE_HEARTBEAT_MS = 10
@@ -116,7 +117,7 @@ class CanDrive:
         self.wanted, self.reason = False, ''
         self._lock = threading.Lock()
         self._heard = threading.Event()
-        self._sync_ns = 0
+        self._asked: deque[int] = deque(maxlen=8)  # SYNCs that are not answered yet, ns
         self._answered = 0.0
         self._last: Answer | None = None
         self._emergency = ''
@@ -200,10 +201,22 @@ class CanDrive:
         except ValueError:
             return
         with self._lock:
-            answer = Answer(self._sync_ns, state, counts, self.scale.torque(torque), self._inputs)
+            sync_ns = self._answered_sync()
+            if sync_ns is None:
+                return
+            answer = Answer(sync_ns, state, counts, self.scale.torque(torque), self._inputs)
             self.answers.append(answer)
             self._last, self._answered = answer, time.monotonic()
         self._heard.set()
+
+    def _answered_sync(self) -> int | None:
+        """Which SYNC an answer belongs to: the oldest one that can still be answered."""
+        now = self._wall_ns()
+        while self._asked:
+            sync_ns = self._asked.popleft()
+            if now - sync_ns < LATEST_NS:
+                return sync_ns
+        return None
 
     def _on_inputs(self, cob: int, data: bytearray, timestamp: float) -> None:
         if len(data) == 4:
@@ -257,7 +270,7 @@ class CanDrive:
         try:
             self._network.send_message(0x200 + self.node, COMMAND.pack(self._word(state), target))
             with self._lock:
-                self._sync_ns = self._wall_ns()
+                self._asked.append(self._wall_ns())
             self._network.send_message(SYNC, b'')
             self._network.send_message(HEARTBEAT + HOST, bytes([OPERATIONAL]))
         except (can.CanError, OSError) as error:

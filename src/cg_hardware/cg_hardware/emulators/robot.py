@@ -1,6 +1,6 @@
 """The compass gait that is not there, behind an IMU and a drive that are not there either.
 
-    python -m cg_hardware.emulators.robot FOLDER [--model NAME] [--stance inner] [--lean 0.05]
+    python -m cg_hardware.emulators.robot FOLDER [--model NAME] [--setup YAML] [--state X ...]
 
 makes FOLDER/imu, the serial line of a 3DM-GX3-25, and FOLDER/can, a serial CAN adapter with a
 CiA 402 drive behind it. A person holds the robot until its drive is enabled; from then on it
@@ -19,6 +19,8 @@ the emulation up since the last report (`late`, s): what was measured meanwhile 
 """
 
 import argparse
+import contextlib
+import gc
 import json
 import math
 import os
@@ -26,6 +28,7 @@ import random
 import select
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +41,10 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_hardware.emulators.cia402_device import Cia402Device
 from cg_hardware.emulators.gx3_device import Gx3Device
 from cg_hardware.emulators.wires import Pty, SerialCan
+from cg_hardware.simulation import read_setup
 
 STEP = 0.002  # s of the body, and of its sensors
+PRIORITY = -19  # niceness, where it may be had
 BEHIND = 0.5  # s that the emulation may be late before it lets time go
 DRIFT = 40e-6  # of the IMU's quartz
 SHELL = 12_345  # counts at which the encoder wakes up
@@ -53,15 +58,15 @@ class EmulatedRobot:
     Args:
         folder: Gets the ends of the wires.
         model: Of the body.
-        stance: Leg that stands.
-        lean: Of both legs at the start, rad.
+        setup: What was done to the rig.
+        state: Free coordinates and their rates at the start, rad and rad/s.
         seed: Of the sensors' noise, of jitter and garbage.
     """
 
-    def __init__(self, folder: Path, model: Model, stance: str, lean: float, seed: int = 1):
-        self._plant = Plant(
-            model, Setup(stance=stance), np.array([lean, lean, 0.0, 0.0]), STEP, seed
-        )
+    def __init__(
+        self, folder: Path, model: Model, setup: Setup, state: Sequence[float], seed: int = 1
+    ):
+        self._plant = Plant(model, setup, np.array(state), STEP, seed)
         resolution = model.sensors['hip_angle'].get('resolution')
         self._count = resolution.value if resolution else 2 * math.pi / 20_000
         self._random = random.Random(seed)
@@ -74,6 +79,7 @@ class EmulatedRobot:
         )  # wraps within the first half minute
         self.drive = Cia402Device()
         self._greeted = False
+        self._hip, self._hip_rate = self._plant.measure().outputs['hip_angle'], 0.0
         self._held = True
         self._silent: set[str] = set()
         self._usb_s = self._jitter_s = 0.0
@@ -89,6 +95,13 @@ class EmulatedRobot:
         """Time of the body in s."""
         return self.ticks * STEP
 
+    @property
+    def lean(self) -> float:
+        """Lean of the stance leg in rad; 0 of one that is held."""
+        if self._plant.setup.fixture != 'none':
+            return 0.0
+        return float(self._plant.state[STANCES.index(self._plant.stance)])
+
     def move(self) -> None:
         """Move the body on by STEP, and take the IMU's sample that is due."""
         if self._held and self.drive.state == 'operation enabled':
@@ -99,12 +112,12 @@ class EmulatedRobot:
                 self._plant.advance()
             except SimulationError:
                 self._held = True  # it lies on the floor
-            lean = self._plant.state[STANCES.index(self._plant.stance)]
-            self.farthest = max(self.farthest, abs(float(lean)))
+            self.farthest = max(self.farthest, abs(self.lean))
         self.ticks += 1
         measured = self._plant.measure()
         outputs = measured.outputs
-        self.drive.counts = SHELL + round(outputs['hip_angle'] / self._count)
+        self._hip_rate = (outputs['hip_angle'] - self._hip) / STEP
+        self._hip = outputs['hip_angle']
         self.drive.inputs = sum(
             FOOT_BITS[leg] for leg, force in measured.contact.items() if force > 0.0
         )
@@ -119,6 +132,9 @@ class EmulatedRobot:
         Args:
             now: Time in s since the start.
         """
+        # The encoder is read at the SYNC, between two steps of the body.
+        hip = self._hip + self._hip_rate * min(max(now - self.now, 0.0), STEP)
+        self.drive.counts = SHELL + round(hip / self._count)
         self._serve_can(now)
         self._serve_imu(now)
 
@@ -196,10 +212,9 @@ class EmulatedRobot:
     def _report(self) -> str:
         changes, self._told = self.drive.log[self._told :], len(self.drive.log)
         late, self.late = self.late, 0.0
-        lean = self._plant.state[STANCES.index(self._plant.stance)]
         return json.dumps({
             'time': self.now, 'state': self.drive.state, 'acting': self.drive.acting,
-            'changes': changes, 'lean': float(lean), 'farthest': self.farthest,
+            'changes': changes, 'lean': self.lean, 'farthest': self.farthest,
             'held': self._held, 'late': late,
         })  # fmt: skip
 
@@ -209,12 +224,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('folder', type=Path)
     parser.add_argument('--model', default='compass_gait_flexible')
-    parser.add_argument('--stance', choices=STANCES, default='inner')
-    parser.add_argument('--lean', type=float, default=0.05, help='of both legs, rad')
+    parser.add_argument('--setup', default='stance: inner', help='YAML text or a file')
+    parser.add_argument(
+        '--state', type=float, nargs='+', default=[0.05, 0.05, 0.0, 0.0],
+        help='free coordinates and their rates at the start, rad and rad/s',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, default=1)
     options = parser.parse_args()
-    model = Model.load(model_path(options.model))
-    robot = EmulatedRobot(options.folder, model, options.stance, options.lean, options.seed)
+    try:
+        model = Model.load(model_path(options.model))
+        setup = read_setup(options.setup)
+        robot = EmulatedRobot(options.folder, model, setup, options.state, options.seed)
+    except (ValueError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)  # devices have a processor of their own
+    gc.freeze()
     os.set_blocking(sys.stdin.fileno(), False)
     print('ready', flush=True)
     begun, words = time.monotonic(), ''
