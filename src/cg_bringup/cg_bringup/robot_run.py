@@ -25,7 +25,7 @@ STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the la
 MISSING = 0.1  # s without requests after which a person must look; busy hosts miss 30 ms
 BLIND = 0.02  # s without the encoder
 NEXT = (
-    'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright, parallel, '
+    'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright and '
     'still), /safety_gate/arm, /drive/enable. /safety_gate/stop is the emergency stop'
 )
 FALLEN = 0.6  # rad of the stance leg

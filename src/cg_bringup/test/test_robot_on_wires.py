@@ -10,78 +10,35 @@ from dataclasses import replace
 
 import pytest
 
-rclpy = pytest.importorskip('rclpy')
+pytest.importorskip('rclpy')
 pytest.importorskip('canopen')
 pytest.importorskip('serial')
 
-from emulated_robot import Emulated  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+import wired_robot
+from std_msgs.msg import String
+from wired_robot import FAULTS, connected, options_in
 
-from cg_bringup.robot_run import RobotOptions, robot_nodes  # noqa: E402
-from cg_bringup.runs import NodeOf  # noqa: E402
-from cg_bringup.supervisor import supervised  # noqa: E402
-from cg_interfaces import topics  # noqa: E402
-from cg_interfaces.domains import own_domain  # noqa: E402
-from cg_interfaces.ros import LATCHED_QOS  # noqa: E402
-from cg_sysid import Model, Options, diagnose, read_bag  # noqa: E402
+from cg_bringup.robot_run import robot_nodes
+from cg_bringup.runs import NodeOf
+from cg_interfaces import topics
+from cg_interfaces.ros import LATCHED_QOS
+from cg_sysid import Model, Options, diagnose, read_bag
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
-PATIENCE = 60.0  # s for nodes to be there
 AT_MOST = 0.02  # s from a fault to zero torque at the drive
 SPREAD = 0.01  # s: the instant of a fault is known from outside by reports of the emulation
 HELD_UP = 0.01  # s by which a host may hold the emulation up for deadlines to mean anything
 
 
-class Person:
-    """Somebody who presses buttons and reads the stage of the robot."""
-
-    def __init__(self):
-        self.node = Node('person')
-        self.stage = ''
-        self.node.create_subscription(String, '/robot_state', self.on_stage, LATCHED_QOS)
-
-    def on_stage(self, message):
-        self.stage = message.data
-
-    def until(self, condition):
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, self.stage
-            rclpy.spin_once(self.node, timeout_sec=0.02)
-
-    def press(self, service):
-        client = self.node.create_client(Trigger, service)
-        self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        self.node.destroy_client(client)
-        return future.result()
-
-    def wait(self, seconds):
-        end = time.monotonic() + seconds
-        self.until(lambda: time.monotonic() > end)
-
-
 @pytest.fixture
-def standing(tmp_path):
+def standing():
     """Emulated robot, person, processes by name: it balances."""
-    with own_domain(), Emulated(tmp_path, '--state', '0.03', '0.03', '0', '0') as robot:
-        options = RobotOptions(
-            imu=str(tmp_path / 'imu'), interface='slcan', channel=str(tmp_path / 'can'),
-            epsilon=0.02,
-        )  # fmt: skip
-        with supervised(robot_nodes(options)) as supervisor:
-            rclpy.init()
-            person = Person()
-            try:
-                begin(robot, person)
-                yield robot, person, supervisor.processes
-            finally:
-                person.node.destroy_node()
-                rclpy.try_shutdown()
+    with wired_robot.standing() as (robot, person, nodes):
+        report = seen(robot)
+        assert report['farthest'] < 0.1, report
+        assert len(report['changes']) > 100
+        yield robot, person, nodes
 
 
 def seen(robot):
@@ -92,21 +49,6 @@ def seen(robot):
     return report
 
 
-def begin(robot, person):
-    """As a person does it."""
-    person.until(lambda: person.stage == 'idle')
-    person.until(lambda: person.press('/drive/zero').success)
-    person.wait(1.0)  # the observer has found the foot that stands
-    assert person.press('/safety_gate/arm').success
-    person.until(lambda: person.stage == 'active')
-    assert person.press('/drive/enable').success
-    person.until(lambda: robot.report()['state'] == 'operation enabled')
-    person.wait(2.0)
-    report = seen(robot)
-    assert report['farthest'] < 0.1, report
-    assert len(report['changes']) > 100
-
-
 def test_it_stands_is_pushed_and_stands(standing):
     robot, person, _ = standing
     robot.ask('push 0.5')
@@ -115,20 +57,6 @@ def test_it_stands_is_pushed_and_stands(standing):
     assert abs(report['lean']) < 0.02
     assert report['farthest'] < 0.2
     assert person.stage == 'active'
-
-
-FAULTS = {
-    'imu_silent': lambda robot, nodes: robot.ask('imu_silent'),
-    'imu_unplugged': lambda robot, nodes: robot.ask('imu_unplug'),
-    'drive_fault': lambda robot, nodes: robot.ask('drive_fault 0x2310'),
-    'bus_silent': lambda robot, nodes: robot.ask('can_silent'),
-    **{
-        f'{name}_killed': lambda robot, nodes, name=name: os.kill(
-            nodes[name].pid, signal.SIGKILL)
-        for name in ('drive', 'imu', 'observer', 'balance', 'safety_gate')
-    },
-    'balance_stopped': lambda robot, nodes: os.kill(nodes['balance'].pid, signal.SIGSTOP),
-}  # fmt: skip
 
 
 ALWAYS = 'drive_fault', 'imu_unplugged', 'drive_killed', 'balance_killed'
@@ -185,10 +113,7 @@ def record(folder, model_file, seed):
         '--seed',
         str(seed),
     )
-    options = RobotOptions(
-        imu=str(folder / 'imu'), interface='slcan', channel=str(folder / 'can'), torque_limit=40.0
-    )
-    nodes = robot_nodes(options)
+    nodes = robot_nodes(options_in(folder))
     del nodes['observer'], nodes['balance']
     nodes['safety_gate'] = replace(nodes['safety_gate'], parameters={
         **nodes['safety_gate'].parameters, 'fall_angle': 0.0,
@@ -198,24 +123,17 @@ def record(folder, model_file, seed):
         'seed': seed,
     }, ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),))  # fmt: skip
     nodes['recorder'] = NodeOf('cg_sysid', 'recorder_node', {'bag': str(bag)}, ending=10.0)
-    with own_domain(), Emulated(folder, *words) as robot:
+    with connected(nodes, folder, *words) as (robot, person, _):
         robot.ask('can_jitter_ms 1')
         robot.ask('usb_ms 4')
-        with supervised(nodes):
-            rclpy.init()
-            person = Person()
-            note = person.node.create_publisher(String, topics.EXPERIMENT, LATCHED_QOS)
-            note.publish(String(data=NOTE % time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())))
-            try:
-                person.until(lambda: person.stage == 'idle')
-                person.until(lambda: person.press('/drive/zero').success)  # it hangs still
-                assert person.press('/safety_gate/arm').success
-                person.until(lambda: person.stage == 'active')
-                assert person.press('/drive/enable').success
-                person.wait(9.0)
-            finally:
-                person.node.destroy_node()
-                rclpy.try_shutdown()
+        note = person.node.create_publisher(String, topics.EXPERIMENT, LATCHED_QOS)
+        note.publish(String(data=NOTE % time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())))
+        person.until(lambda: person.stage == 'idle')
+        person.until(lambda: person.press('/drive/zero').success)  # it hangs still
+        assert person.press('/safety_gate/arm').success
+        person.until(lambda: person.stage == 'active')
+        assert person.press('/drive/enable').success
+        person.wait(9.0)
     return bag
 
 
