@@ -315,6 +315,21 @@ def test_a_sensor_that_dies_is_at_least_doubted(seed):
 FREE = {'mechanism': 'double_pendulum', 'torque': 'zero', 'bandwidth': 1.0, 'amplitude': 1.5}
 
 
+def test_a_command_may_be_revised_beside_what_was_applied():
+    """A gate whose requests stop asks for zero in the place of the last one."""
+    raw = synthesise(Synthesis(), 1)
+    applied = raw.topics['/applied_torque']
+    command = replace(applied, name='/torque_command')
+    raw = replace(raw, topics={**raw.topics, '/torque_command': command})
+    raw = with_samples(raw, '/torque_command', np.sort(np.r_[INDEX, 500]))
+    raw = with_values(raw, '/torque_command', 'hip_torque', assigned(501, 0.0))
+    assert raw.topics['/torque_command'].values['hip_torque'][500] != 0.0
+    (found,) = check_recording(raw).of('duplicates')
+    assert found.severity == 'warning'
+    (alone,) = check_recording(without(raw, '/applied_torque')).of('duplicates')
+    assert alone.severity == 'error'
+
+
 def rounded_twice(values):
     """Counts that a calibration curve has bent: no one quantum fits them."""
     counts = 7e-4 * np.rint(values / 7e-4)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cg_interfaces.channels import mechanism
-from cg_interfaces.topics import EXPERIMENT, TORQUE_COMMAND
+from cg_interfaces.topics import APPLIED_TORQUE, EXPERIMENT, TORQUE_COMMAND
 from cg_sysid.records.clock import FLOOR, independent_arrivals, lost_behind_stamps
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording, RawTopic
@@ -46,7 +46,8 @@ def check_timing(raw: RawRecording) -> Iterator[Finding]:
                 allowed=2,
             )
             continue
-        yield from _order(topic, origin)
+        asked = topic.name == TORQUE_COMMAND and APPLIED_TORQUE in raw.topics
+        yield from _order(topic, origin, asked)
         if topic.name in (EXPERIMENT, TORQUE_COMMAND):
             continue
         yield from _arrivals(raw, topic, origin)
@@ -106,8 +107,15 @@ def _overlap(raw: RawRecording, origin: int) -> Iterator[Finding]:
             )
 
 
-def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
-    """Stamps that repeat or run backwards."""
+def _order(topic: RawTopic, origin: int, asked: bool) -> Iterator[Finding]:
+    """Stamps that repeat or run backwards.
+
+    Args:
+        topic: The topic.
+        origin: Of the recording, ns.
+        asked: It is what was asked for, beside what was applied: a command may be revised, as a
+            gate does whose requests stop.
+    """
     stamp = topic.stamp_ns
     step = np.diff(stamp)
     backward = np.flatnonzero(step < 0)
@@ -136,7 +144,7 @@ def _order(topic: RawTopic, origin: int) -> Iterator[Finding]:
         )
         yield Finding(
             'duplicates',
-            'error' if conflict else 'warning',
+            'error' if conflict and not asked else 'warning',
             topic.name,
             f'{len(repeats)} stamp(s) occur twice'
             + (' with different values' if conflict else '; the copies are dropped'),
