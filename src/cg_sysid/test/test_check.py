@@ -322,7 +322,9 @@ def test_a_command_may_be_revised_beside_what_was_applied():
     command = replace(applied, name='/torque_command')
     raw = replace(raw, topics={**raw.topics, '/torque_command': command})
     raw = with_samples(raw, '/torque_command', np.sort(np.r_[INDEX, 500]))
-    raw = with_values(raw, '/torque_command', 'hip_torque', assigned(501, 0.0))
+    raw = with_values(
+        raw, '/torque_command', 'hip_torque', lambda v: np.where(np.arange(len(v)) == 501, 0.0, v)
+    )
     assert raw.topics['/torque_command'].values['hip_torque'][500] != 0.0
     (found,) = check_recording(raw).of('duplicates')
     assert found.severity == 'warning'
