@@ -24,6 +24,7 @@ from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import led_in, split
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.parallel import run_all
 from cg_sysid.search import settings
@@ -76,7 +77,7 @@ def least(tasks, train, held, workers):
         replace(t, thorough=True, iterations=settings.FITTING.thorough_iterations) for t in tasks
     ]
     found = run_all(try_candidate, [(t, train, held) for t in thorough], workers)
-    return min(chi2(o) + o.train.belief for o in found if not isinstance(o, str))
+    return min(chi2(o) + o.train.belief for o in found if not isinstance(o, Failure))
 
 
 def ties_of(row, workers=None):

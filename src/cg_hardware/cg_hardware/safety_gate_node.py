@@ -12,7 +12,8 @@ was held up does not take it for one from the future, and a machine in lock-step
 The hardware has a watchdog of its own behind the gate.
 
 It also keeps the stage of the robot (lifecycle.py) on /robot_state, one line for people: torque
-passes while the robot is armed or active. With `arming`, as robot.launch.py has it, a person must
+passes while the robot is armed or active. Where several controllers live side by side, `owners`
+names them and `owner`, which may change at any time, is the one that is listened to. With `arming`, as robot.launch.py has it, a person must
 call ~/arm, and after a fault ~/reset first. ~/stop, or true on /emergency_stop, is the emergency
 stop: torque zero until ~/reset.
 
@@ -58,10 +59,22 @@ class GateNodeSettings(GateSettings):
     arming: bool = setting(
         False, 'a person must call ~/arm before torque passes, and after faults'
     )
+    owners: tuple[str, ...] = setting(
+        (),
+        'controllers that may ask, each on /torque_request/NAME; empty: one, on /torque_request',
+    )
+    owner: str = setting('', 'the one of `owners` that is listened to', live=True)
     fall_angle: float = setting(
         0.0, 'lean of the stance leg at which the robot has fallen; 0: it never has', unit='rad',
         minimum=0.0,
     )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.owner not in (self.owners or ('',)):
+            raise ValueError(
+                f'owner is {self.owner!r}; owners has {", ".join(self.owners) or "nobody"}'
+            )
 
 
 class SafetyGateNode(Node):
@@ -76,9 +89,13 @@ class SafetyGateNode(Node):
         self.gate = TorqueGate(self.declared.values, self.joints)
         self.publisher = self.create_publisher(JointState, topics.TORQUE_COMMAND, SENSOR_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
-        self.requests = self.create_subscription(
-            JointState, topics.TORQUE_REQUEST, self.on_request, SENSOR_QOS
-        )
+        # Who may ask -> what comes from there; '' where there is one controller only.
+        self.requests = {
+            owner: self.create_subscription(
+                JointState, f'{topics.TORQUE_REQUEST}/{owner}'.rstrip('/'),
+                partial(self.on_request, owner), SENSOR_QOS,
+            ) for owner in self.declared.values.owners or ('',)
+        }  # fmt: skip
         measurement = channels.mechanism(mechanism).measurement
         self.measurements = self.create_subscription(
             Imu if measurement == topics.IMU else JointState,
@@ -181,10 +198,20 @@ class SafetyGateNode(Node):
             return self._measured_ns
         return min(stamp_ns, time.time_ns())
 
-    def on_request(self, request: JointState) -> None:
-        """Judge a request and pass on what may act."""
+    def _rivals(self) -> int:
+        """Publishers on the topic of the one that may ask."""
+        return self.requests[self.declared.values.owner].get_publisher_count()
+
+    def on_request(self, owner: str, request: JointState) -> None:
+        """Judge a request and pass on what may act.
+
+        A hand-over is one change of the parameter `owner`: what the one before asked for acts
+        until the other's first request, or until it is stale.
+        """
         self.gate.settings = self.declared.values
-        self.gate.publishers = self.requests.get_publisher_count()
+        if owner != self.declared.values.owner:
+            return
+        self.gate.publishers = self._rivals()
         now, stamp_ns = time.monotonic_ns(), to_nanoseconds(request.header.stamp)
         if not self.lifecycle.passes:
             # An answer all the same: a machine in lock-step waits for it.
@@ -210,7 +237,7 @@ class SafetyGateNode(Node):
     def poll(self) -> float:
         """Send zero torque while requests are missing."""
         now = time.monotonic_ns()
-        self.gate.publishers = self.requests.get_publisher_count()
+        self.gate.publishers = self._rivals()
         judgement = self.gate.torque(now)
         if judgement.doubt and not self._stale:
             self._stale = True

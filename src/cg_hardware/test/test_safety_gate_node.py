@@ -53,7 +53,7 @@ class Bench:
             self.executor.add_node(node)
         self.until(
             lambda: (
-                self.publisher.get_subscription_count()
+                (settings.get('owners') or self.publisher.get_subscription_count())
                 and self.imu.get_subscription_count()
                 and self.gate.publisher.get_subscription_count()
                 and self.gate.diagnostics.get_subscription_count()
@@ -201,7 +201,7 @@ def test_a_request_must_name_its_joint(bench, names):
 def test_a_second_publisher_is_an_error_and_nobody_gets_torque(bench):
     gate, publisher, commands, until = bench
     rival = bench.peer.create_publisher(JointState, '/torque_request', SENSOR_QOS)
-    until(lambda: gate.requests.get_publisher_count() == 2)
+    until(lambda: gate.requests[''].get_publisher_count() == 2)
     for stamp, speaker in enumerate((publisher, rival, publisher), start=1):
         speaker.publish(request(2.0, stamp))
         until(lambda stamp=stamp: stamp in answers_to(commands))
@@ -209,7 +209,7 @@ def test_a_second_publisher_is_an_error_and_nobody_gets_torque(bench):
     until(lambda: any('2 publishers' in status.message for status in bench.reports))
     assert bench.reports[-1].level == DiagnosticStatus.ERROR
     bench.peer.destroy_publisher(rival)
-    until(lambda: gate.requests.get_publisher_count() == 1)
+    until(lambda: gate.requests[''].get_publisher_count() == 1)
     publisher.publish(request(2.0, 4))
     until(lambda: 4 in answers_to(commands))
     assert answers_to(commands)[4] == 2.0
@@ -265,3 +265,26 @@ def test_a_fault_is_told_and_stays_until_a_person_resets_and_arms(robot, what, s
     assert robot.live(0.2) == 0.0
     assert robot.call('arm').success
     assert robot.live(0.3) == 2.0
+
+
+def test_a_hand_over_is_one_change_and_leaves_no_gap():
+    with running(owners=['balance', 'walk'], owner='balance') as bench:
+        gate, _, commands, until = bench
+        speakers = {
+            name: bench.peer.create_publisher(JointState, f'/torque_request/{name}', SENSOR_QOS)
+            for name in ('balance', 'walk')
+        }
+        until(lambda: all(s.get_subscription_count() for s in speakers.values()))
+
+        def both(stamp):
+            for torque, speaker in zip((1.0, 2.0), speakers.values(), strict=True):
+                speaker.publish(request(torque, stamp))
+            until(lambda: stamp in answers_to(commands))
+
+        both(1)
+        (result,) = gate.set_parameters([Parameter('owner', value='walk')])
+        assert result.successful
+        both(2)
+        assert answers_to(commands) == {1: 1.0, 2: 2.0}
+        (result,) = gate.set_parameters([Parameter('owner', value='stranger')])
+        assert "owner is 'stranger'; owners has balance, walk" in result.reason

@@ -16,6 +16,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.between_recordings import Wandering
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns
@@ -53,7 +54,7 @@ def what_wanders(
     numbers = list(numbers_of(o.train.model, data_sets, names))
     nothing = (o, '', None, data_sets, start, np.inf, ITERATIONS)
     base = run(_fit_with_own, [nothing], 'all recordings as one')[0]
-    if isinstance(base, str) or base.normalised_error < settings.NOISE.at_noise:
+    if isinstance(base, Failure) or base.normalised_error < settings.NOISE.at_noise:
         return None
     # Who leaves more is neither named nor in the way of another.
     reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
@@ -121,7 +122,7 @@ def _fit_with_own(
     start: Fit,
     reach: float,
     iterations: int,
-) -> Fit | str:
+) -> Fit | Failure:
     """A fit to all records where every recording has its own size of the effect that is named."""
     model = with_own(o.model, name, at, o.train.model) if name else o.model
     bounds = o.task.bounds
@@ -137,7 +138,7 @@ def _fit_with_own(
         )
         return replace(found, model=o.model)  # a class made here does not leave this process
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
-        return str(error)
+        return Failure(str(error))
 
 
 def with_own(model: Model, name: str, at: str | None, fitted: Model) -> Model:

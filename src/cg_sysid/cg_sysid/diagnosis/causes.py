@@ -12,6 +12,7 @@ from cg_sysid.diagnosis.result import Cause
 from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.thorough import fitted_to_all, tie
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.identification.identify import Fit
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
@@ -78,7 +79,7 @@ def with_events(work: Workspace, final: Outcome, cause: Cause) -> Cause:
     shapes = {f'{cause.label}.{p.name}': p.leeway for p in parameters if p.leeway}
     task = replace(final.task, bounds={**final.task.bounds, **shapes})
     found = fitted_to_all(work, replace(final, task=task))
-    if isinstance(found, str):
+    if isinstance(found, Failure):
         log.info('%s on all records: %s', cause.label, found)
         return cause
     names = [name for side in final.data_sets for name in side]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
 from cg_sysid.search.model_selection import Comparison, settled
@@ -53,7 +54,7 @@ def led_deeper(
             break
         task = replace(task_alone, warm_starts=(warm_start,), base=None)
         deeper = work.halving.fit([task], f'{title_of(work.added(base))}, deeper')[0]
-        if isinstance(deeper, str) or settings.SCREENING.same * chi2(deeper) > chi2(base):
+        if isinstance(deeper, Failure) or settings.SCREENING.same * chi2(deeper) > chi2(base):
             break
         work.halving.forget(task_alone)
         base = replace(deeper, label=base.label)

@@ -28,6 +28,7 @@ from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.diagnosis.small_faults import less_small_faults
 from cg_sysid.diagnosis.thorough import ties_settled
 from cg_sysid.diagnosis.workspace import Progress, Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
@@ -202,8 +203,8 @@ def search(work: Workspace) -> Diagnosis:
         IdentificationError: if the nominal model cannot be fitted.
     """
     base = work.halving.fit([Task(work.nominal)], 'fitting the nominal model')[0]
-    if isinstance(base, str):
-        raise IdentificationError(base)
+    if isinstance(base, Failure):
+        raise IdentificationError(base.reason)
     work.found = work.under_way = base
     try:
         final = extend(work, base)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from cg_sysid.diagnosis.comparing import compare
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.search.candidates import Outcome, Task, chi2
 from cg_sysid.search.model_selection import Comparison
 from cg_sysid.search.nuisance import with_nuisances
@@ -46,7 +47,7 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
         task = Task(model, events=final.events, bounds=bounds)
         known = not others and not bounds
         lean = nominal if known else work.halving.fit([task], f'model without {label}')[0]
-        if isinstance(lean, str):
+        if isinstance(lean, Failure):
             log.info('without %s: %s', label, lean)
             return None
         # Who would take the place has to come up to what is there.

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from cg_sysid.diagnosis.comparing import compare, refitted
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, parameters_of, started_from
 from cg_sysid.search.model_selection import (
@@ -32,7 +33,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     model, bounds = with_nuisances(o.model, work.setups())
     title = f'{title_of(work.added(o))}, with small faults'
     found = work.halving.fit([Task(model, events=o.events, bounds=bounds)], title)[0]
-    if isinstance(found, str):
+    if isinstance(found, Failure):
         log.info('small faults: %s', found)
         return o
     if at_noise(o):
@@ -120,7 +121,7 @@ def without_small_faults(work: Workspace, o: Outcome, gone: Sequence[str]) -> Ou
     start = started_from(o.train, model, bounds)
     task = Task(model, events=o.events, bounds=bounds, warm_starts=(start,))
     lean = work.halving.fit([task], 'without small faults')[0]
-    return None if isinstance(lean, str) else lean
+    return None if isinstance(lean, Failure) else lean
 
 
 def told_small_faults(work: Workspace, final: Outcome) -> list[str]:

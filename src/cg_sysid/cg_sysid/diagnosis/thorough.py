@@ -5,6 +5,7 @@ from dataclasses import replace
 from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.workspace import Workspace, structure
+from cg_sysid.errors import Failure
 from cg_sysid.identification.identify import Fit
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, fit_to_all, one_minimum
@@ -82,7 +83,7 @@ def tie(work: Workspace, comparison: Comparison, label: str) -> Comparison | Non
     )
 
 
-def fitted_to_all(work: Workspace, o: Outcome) -> Fit | str:
+def fitted_to_all(work: Workspace, o: Outcome) -> Fit | Failure:
     """A thorough fit of an outcome's structure to all records, or why there is none."""
     key = structure(o)
     if key not in work.joint:

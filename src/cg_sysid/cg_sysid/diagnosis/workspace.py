@@ -8,6 +8,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.result import Options
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.kept_fits import keeping
@@ -68,7 +69,7 @@ class Workspace:
         self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         self.comparisons: dict[tuple[frozenset[str], bool], Comparison] = {}
         self.thorough: dict[Structure, Outcome] = {}
-        self.joint: dict[Structure, Fit | str] = {}
+        self.joint: dict[Structure, Fit | Failure] = {}
         self.found: Outcome
         self.under_way: Outcome
         self.rounds: list[Round] = []

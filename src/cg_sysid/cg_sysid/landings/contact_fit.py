@@ -18,6 +18,7 @@ from cg_dynamics.effects.effect import ContactLaw
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.deadline import check_time
+from cg_sysid.errors import Failure
 from cg_sysid.landings.landings import NUDGES, OWN, Passage, simulate_passage
 
 # Effect -> what it changes of the law.
@@ -110,7 +111,7 @@ class _State:
         return float(self.residual @ self.residual)
 
 
-def fit_contact(task: ContactTask) -> ContactFit | str:
+def fit_contact(task: ContactTask) -> ContactFit | Failure:
     """Fit one law on the training landings and score it on those held out.
 
     Returns:
@@ -119,13 +120,15 @@ def fit_contact(task: ContactTask) -> ContactFit | str:
     try:
         return _fit(_Fitter(task), task)
     except np.linalg.LinAlgError as error:
-        return f'{" and ".join(task.effects) or "the law"}: {error}'
+        return Failure(f'{" and ".join(task.effects) or "the law"}: {error}')
 
 
-def _fit(fitter: '_Fitter', task: ContactTask) -> ContactFit | str:
+def _fit(fitter: '_Fitter', task: ContactTask) -> ContactFit | Failure:
     start = fitter.start()
     if start is None:
-        return f'no landing can be simulated with {" and ".join(task.effects) or "the law"}'
+        return Failure(
+            f'no landing can be simulated with {" and ".join(task.effects) or "the law"}'
+        )
     theta, states, converged = fitter.minimise(start)
     spread = fitter.uncertainty(theta, states)
     values = {

@@ -16,6 +16,7 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.contact import contact_law
+from cg_sysid.errors import Failure
 from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
 from cg_sysid.identification.unknowns import without_events
 from cg_sysid.landings.contact_fit import FREE, SMALLEST, ContactFit, ContactTask, fit_contact
@@ -64,7 +65,7 @@ def judge_landings(
     stated = contact_law(model)
     task = ContactTask(model, stated, (), train, held, sigma)
     base = run(fit_contact, [(task,)], 'landings as the model states them')[0]
-    if isinstance(base, str):
+    if isinstance(base, Failure):
         return None
     present = {effect.label for effect in model.effects}
     names = [n for n in FREE if n not in present and (effects is None or n in effects)]

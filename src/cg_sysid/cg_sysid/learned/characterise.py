@@ -17,6 +17,7 @@ from cg_dynamics.effects.effect import TIME
 from cg_dynamics.effects.unmodelled import COSINES, LearnedEffect
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, without_events
@@ -275,13 +276,13 @@ def whole_fit(
     own: Mapping[str, Mapping[str, float]],
     train: Sequence[DataSet],
     held: Sequence[DataSet],
-) -> tuple[Fit, Fit] | str:
+) -> tuple[Fit, Fit] | Failure:
     """Fit of whole records from given values on, and score of those held out; or why not."""
     try:
         found = fit(task.model, train, at=at, own=own, bounds=task.bounds)
         return found, score(found.model, held, own=own)
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
-        return str(error)
+        return Failure(str(error))
 
 
 def _follows_on(whole: tuple[Fit, Fit], found: Outcome, base: Outcome) -> bool:

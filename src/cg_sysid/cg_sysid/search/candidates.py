@@ -11,6 +11,7 @@ from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
@@ -133,7 +134,7 @@ def starts_of(name: str) -> list[dict[str, float]]:
     ]
 
 
-def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
+def screen(task: Task, train: Sequence[DataSet]) -> Screening | Failure:
     """Fit one candidate to an excerpt of the training data sets, from each of its starts.
 
     Returns:
@@ -158,7 +159,7 @@ def screen(task: Task, train: Sequence[DataSet]) -> Screening | str:
             )
             warm_starts = warm_starts[: settings.SCREENING.followed]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
-        return str(error)
+        return Failure(str(error))
     return Screening(
         label, replace(task, warm_starts=warm_starts), warm_starts[0].normalised_error
     )
@@ -187,7 +188,9 @@ def _as_cause(task: Task) -> Task:
     return replace(task, bounds=others | shapes)
 
 
-def try_candidate(task: Task, train: Sequence[DataSet], held: Sequence[DataSet]) -> Outcome | str:
+def try_candidate(
+    task: Task, train: Sequence[DataSet], held: Sequence[DataSet]
+) -> Outcome | Failure:
     """Fit one candidate on the training data sets and score it on the held-out ones.
 
     Returns:
@@ -215,7 +218,7 @@ def try_candidate(task: Task, train: Sequence[DataSet], held: Sequence[DataSet])
             for data_set, motion in zip(data_sets, found.motions, strict=True)
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
-        return str(error)
+        return Failure(str(error))
     return Outcome(
         task, label, model, best, held_score, residuals,
         best.belief + best.starts + held_score.starts,
@@ -225,7 +228,7 @@ def try_candidate(task: Task, train: Sequence[DataSet], held: Sequence[DataSet])
     )  # fmt: skip
 
 
-def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | str:
+def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
     """A thorough fit of an outcome's structure to all records, those held out among them.
 
     Rivals that have earned their place on held-out records are told apart by this: values that
@@ -248,7 +251,7 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | str:
             iterations=settings.FITTING.thorough_iterations,
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
-        return str(error)
+        return Failure(str(error))
 
 
 def shared_unknowns(found: Fit, bounds: Bounds) -> int:

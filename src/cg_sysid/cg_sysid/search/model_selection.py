@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
@@ -100,7 +101,7 @@ class ModelSelection:
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
 
     def compare(
-        self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | str] = ()
+        self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | Failure] = ()
     ) -> Comparison:
         """Rank outcomes that extend a base.
 

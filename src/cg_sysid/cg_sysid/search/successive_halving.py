@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.search import settings
@@ -54,9 +55,9 @@ class SuccessiveHalving:
 
     def __init__(self, train: Sequence[DataSet], held: Sequence[DataSet], carry_out: CarryOut):
         self.train, self.held, self.carry_out = train, held, carry_out
-        self.screenings: dict[tuple, Screening | str] = {}  # by _structure
+        self.screenings: dict[tuple, Screening | Failure] = {}  # by _structure
 
-    def fit(self, tasks: Sequence[Task], what: str) -> list[Outcome | str]:
+    def fit(self, tasks: Sequence[Task], what: str) -> list[Outcome | Failure]:
         """Fits to whole records, in the order of the tasks; a sentence for one that failed."""
         return self.carry_out(try_candidate, [(t, self.train, self.held) for t in tasks], what)
 
@@ -72,7 +73,7 @@ class SuccessiveHalving:
         screenings = self.carry_out(screen, [(task, self.train) for task in led], what)
         for task, screening in zip(new, screenings, strict=True):
             self.screenings[_structure(task)] = screening
-            if isinstance(screening, str):
+            if isinstance(screening, Failure):
                 log.info('%s: %s', task.effect, screening)
         known = [self.screenings[_structure(task)] for task in tasks]
         return [screening for screening in known if isinstance(screening, Screening)]
@@ -229,7 +230,7 @@ class SuccessiveHalving:
     def _fitted(self, tasks: Iterable[Task], what: str) -> dict[str, Outcome]:
         found, tasks = {}, _longest_first(tasks)
         for task, outcome in zip(tasks, self.fit(tasks, what), strict=True):
-            if isinstance(outcome, str):
+            if isinstance(outcome, Failure):
                 log.info('%s: %s', task.effect, outcome)
             else:
                 found[outcome.label] = outcome
