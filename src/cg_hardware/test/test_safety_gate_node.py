@@ -91,12 +91,14 @@ class Bench:
                 ['inner', 'outer'],
                 [9.0, lean],
             )
-            for publisher, message in (
-                (self.imu, imu), (self.applied, applied), (self.state, state),
-                (self.publisher, request(torque, now)),
-            ):  # fmt: skip
+            for message in (imu, applied, state):
                 message.header.stamp = to_stamp(now)
-                publisher.publish(message)
+            self.imu.publish(imu)
+            self.applied.publish(applied)
+            self.state.publish(state)
+            # A request that overtakes its measurement is dated ahead.
+            self.until(lambda now=now: self.gate._measured_ns == now)
+            self.publisher.publish(request(torque, now))
             for _ in range(4):
                 self.executor.spin_once(timeout_sec=0.001)
             self.gate.poll()
