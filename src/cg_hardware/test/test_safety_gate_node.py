@@ -81,7 +81,7 @@ class Bench:
         return future.result()
 
     def live(self, seconds, torque=2.0, lean=0.0):
-        """So long a robot whose controller asks for a torque; the last one that came through."""
+        """So long a robot whose controller asks for a torque; what the last request came to."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             now = time.time_ns()
@@ -99,10 +99,8 @@ class Bench:
             # A request that overtakes its measurement is dated ahead.
             self.until(lambda now=now: self.gate._measured_ns == now)
             self.publisher.publish(request(torque, now))
-            for _ in range(4):
-                self.executor.spin_once(timeout_sec=0.001)
-            self.gate.poll()
-        return self.commands[-1].effort[0]
+            self.until(lambda now=now: now in answers_to(self.commands))
+        return answers_to(self.commands)[now]
 
     def __iter__(self):
         return iter((self.gate, self.publisher, self.commands, self.until))
