@@ -87,7 +87,8 @@ def begin(robot, person):
     person.until(lambda: person.stage == 'idle')
     person.until(lambda: person.press('/drive/zero').success)
     person.wait(1.0)  # the observer has found the foot that stands
-    assert person.press('/safety_gate/arm').success
+    # The observer has got over the new zero of the encoder.
+    person.until(lambda: person.press('/safety_gate/arm').success)
     person.until(lambda: person.stage == 'active')
     assert person.press('/drive/enable').success
     person.until(lambda: robot.report()['state'] == 'operation enabled')

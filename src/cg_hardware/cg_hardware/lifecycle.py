@@ -60,6 +60,7 @@ class Lifecycle:
         self.stage = Stage.UNCONFIGURED if arming else Stage.ARMED
         self.reason = 'nothing is heard yet' if arming else ''
         self._stopped = False
+        self._last = Signs()
 
     @property
     def passes(self) -> bool:
@@ -73,6 +74,7 @@ class Lifecycle:
 
     def see(self, signs: Signs) -> None:
         """Go to the stage that follows from what is seen."""
+        self._last = signs
         if signs.stopped:
             self.stop()
             return
@@ -106,6 +108,8 @@ class Lifecycle:
         """A person lets torque pass; why not, or empty."""
         if self.stage != Stage.IDLE:
             return f'only an idle robot can be armed; this one is {self.line}'
+        if wrong := self._wrong(self._last):
+            return f'not armed: {wrong}'
         self._go(Stage.ARMED, 'waits for torque requests')
         return ''
 

@@ -57,6 +57,15 @@ def test_a_robot_that_waits_for_its_controller_is_not_at_fault():
     assert robot.line == 'armed: waits for torque requests'
 
 
+def test_a_robot_that_lies_is_not_armed():
+    robot = Lifecycle(arming=True, fall_angle=0.6)
+    robot.see(Signs(lean=1.2))
+    robot.see(Signs(lean=1.2))
+    assert robot.arm() == 'not armed: the robot has fallen: the stance leg leans by 1.20 rad'
+    robot.see(Signs(lean=0.1))
+    assert robot.arm() == ''
+
+
 def test_the_stop_holds_against_arming():
     robot = active()
     robot.stop()
