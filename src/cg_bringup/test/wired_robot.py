@@ -99,6 +99,7 @@ FAULTS = {
     'imu_silent': lambda robot, nodes: robot.ask('imu_silent'),
     'imu_unplugged': lambda robot, nodes: robot.ask('imu_unplug'),
     'drive_fault': lambda robot, nodes: robot.ask('drive_fault 0x2310'),
+    'bus_unplugged': lambda robot, nodes: robot.ask('can_unplug'),
     'bus_silent': lambda robot, nodes: robot.ask('can_silent'),
     **{
         f'{name}_killed': lambda robot, nodes, name=name: os.kill(

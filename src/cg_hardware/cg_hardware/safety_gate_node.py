@@ -13,9 +13,9 @@ The hardware has a watchdog of its own behind the gate.
 
 It also keeps the stage of the robot (lifecycle.py) on /robot_state, one line for people: torque
 passes while the robot is armed or active. Where several controllers live side by side, `owners`
-names them and `owner`, which may change at any time, is the one that is listened to. With `arming`, as robot.launch.py has it, a person must
-call ~/arm, and after a fault ~/reset first. ~/stop, or true on /emergency_stop, is the emergency
-stop: torque zero until ~/reset.
+names them and `owner`, which may change at any time, is the one that is listened to. With
+`arming`, as robot.launch.py has it, a person must call ~/arm, and after a fault ~/reset first.
+~/stop, or true on /emergency_stop, is the emergency stop: torque zero until ~/reset.
 
 in    /torque_request, /emergency_stop, /imu, or /joint_states of a pendulum; with `arming`
       /applied_torque; with `fall_angle` /state

@@ -119,6 +119,17 @@ def test_a_drive_that_falls_silent_is_given_up(robot, drive):
     assert not drive.wanted
 
 
+def test_a_bus_that_is_pulled_is_an_error_and_can_be_closed(robot, drive):
+    enabled(drive, 4.0)
+    spin(drive, 0.1, 4.0)
+    robot.ask('can_unplug')
+    with pytest.raises(DriveError, match='drive 1'):
+        spin(drive, 2.0, 4.0)
+    assert 'the bus is gone' in drive.reason or drive.reason == 'the drive is silent'
+    drive.close()
+    assert robot.report()['acting'] == 0
+
+
 def test_what_is_not_there_is_named(tmp_path, robot):
     with pytest.raises(DriveError, match=r'slcan:.*nothing'):
         CanDrive({'interface': 'slcan', 'channel': str(tmp_path / 'nothing')}, 1)

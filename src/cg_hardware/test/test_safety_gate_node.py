@@ -99,8 +99,8 @@ class Bench:
             # A request that overtakes its measurement is dated ahead.
             self.until(lambda now=now: self.gate._measured_ns == now)
             self.publisher.publish(request(torque, now))
-            self.until(lambda now=now: now in answers_to(self.commands))
-        return answers_to(self.commands)[now]
+            self.until(lambda now=now: now in answers_to(self.commands[-20:]))
+        return answers_to(self.commands[-20:])[now]
 
     def __iter__(self):
         return iter((self.gate, self.publisher, self.commands, self.until))
@@ -130,7 +130,8 @@ def bench():
 @pytest.fixture
 def robot():
     """A gate that a person arms."""
-    with running(arming=True, fall_angle=0.6) as bench:
+    # As patient as a busy host needs: what is shown here is no matter of milliseconds.
+    with running(arming=True, fall_angle=0.6, stale_after=0.5) as bench:
         yield bench
 
 

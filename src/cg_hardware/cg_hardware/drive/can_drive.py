@@ -11,6 +11,7 @@ because the drive then is not enabled, and is enabled again only by `enable`.
     TPDO 2  0x280 + node   digital inputs (uint32), when they change, and every 50 ms
 """
 
+import contextlib
 import struct
 import threading
 import time
@@ -310,13 +311,12 @@ class CanDrive:
 
     def close(self) -> None:
         """Leave the drive without torque, and the bus."""
-        try:
-            if self._network.bus is not None:
-                self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
-                self._network.send_message(SYNC, b'')
-        except (can.CanError, OSError):
-            pass  # the drive's own watch sees to it
-        self._network.disconnect()
+        # Where the bus is gone the drive's own watch sees to it.
+        with contextlib.suppress(can.CanError, OSError):
+            self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
+            self._network.send_message(SYNC, b'')
+        with contextlib.suppress(can.CanError, OSError, RuntimeError):
+            self._network.disconnect()
 
 
 def told(bus: dict) -> str:

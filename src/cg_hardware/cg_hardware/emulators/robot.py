@@ -9,7 +9,8 @@ stands or falls by what the drive is told. Time is this process's own, and runs 
 Faults are asked for on standard input, one a line, with a number where one is needed:
 
     imu_silent  imu_back  imu_frozen  imu_garbage N  imu_cut N  imu_unplug  imu_plug
-    can_silent  can_back  can_garbage N  drive_fault CODE  drive_off  drive_on
+    can_silent  can_back  can_garbage N  can_unplug  can_plug
+    drive_fault CODE  drive_off  drive_on
     usb_ms T (the IMU's bytes go out every T ms)  can_jitter_ms T  push P (N s at the hip)
     let_go  hold  report
 
@@ -72,7 +73,7 @@ class EmulatedRobot:
         self._random = random.Random(seed)
         self._folder = folder
         self.imu_line: Pty | None = Pty(folder / 'imu')
-        self.can_line = Pty(folder / 'can')
+        self.can_line: Pty | None = Pty(folder / 'can')
         self._can = SerialCan(self.can_line)
         self.imu = Gx3Device(
             drift=DRIFT, timer=4_294_000_000
@@ -139,13 +140,13 @@ class EmulatedRobot:
         self._serve_imu(now)
 
     def _serve_can(self, now: float) -> None:
-        frames = self._can.receive()
+        frames = self._can.receive() if self.can_line is not None else []
         answers = [f for cob, data in frames for f in self.drive.receive(cob, data, now)]
         if self._can.opened and not self._greeted:
             self._greeted = True
             answers += self.drive.power_on()
         answers += self.drive.step(now)
-        if 'can' in self._silent:
+        if 'can' in self._silent or self.can_line is None:
             return
         for frame in answers:
             late = self._random.uniform(0.0, self._jitter_s) if self._jitter_s else 0.0
@@ -186,10 +187,18 @@ class EmulatedRobot:
         elif word == 'imu_plug':
             self.imu_line = Pty(self._folder / 'imu')
             self.imu = Gx3Device(drift=DRIFT, timer=self._random.randrange(1 << 32))
-        elif word == 'can_garbage':
+        elif word == 'can_unplug' and self.can_line is not None:
+            self.can_line.close()
+            self.can_line = None
+        elif word == 'can_plug':
+            self.can_line = Pty(self._folder / 'can')
+            self._can = SerialCan(self.can_line)
+        elif word == 'can_garbage' and self.can_line is not None:
             self.can_line.write(self._random.randbytes(int(number)))
         elif word == 'drive_fault':
-            self._can.send(self.drive.fault(int(number), self.now))
+            emergency = self.drive.fault(int(number), self.now)
+            if self.can_line is not None:
+                self._can.send(emergency)
         elif word == 'drive_off':
             self.drive.dead = True
             self.drive.log.append((self.now, 0))
