@@ -127,6 +127,7 @@ def test_a_bus_that_is_pulled_is_an_error_and_can_be_closed(robot, drive):
         spin(drive, 2.0, 4.0)
     assert 'the bus is gone' in drive.reason or drive.reason == 'the drive is silent'
     drive.close()
+    time.sleep(0.2)
     assert robot.report()['acting'] == 0
 
 

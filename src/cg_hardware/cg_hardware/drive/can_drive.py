@@ -140,6 +140,8 @@ class CanDrive:
 
     def _open(self, bus: dict) -> None:
         self._network = canopen.Network()
+        # Any listener of python-can will do, whatever canopen's annotation says.
+        self._network.listeners.append(_ReadErrors())  # type: ignore[arg-type]
         try:
             self._network.connect(**bus)
         except (can.CanError, OSError, ValueError) as error:
@@ -317,6 +319,16 @@ class CanDrive:
             self._network.send_message(SYNC, b'')
         with contextlib.suppress(can.CanError, OSError, RuntimeError):
             self._network.disconnect()
+
+
+class _ReadErrors(can.Listener):
+    """Errors of reading the bus: the next cycle meets them as well, and says so."""
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Messages are for others."""
+
+    def on_error(self, exc: Exception) -> None:
+        """The thread that reads ends without a word."""
 
 
 def told(bus: dict) -> str:
