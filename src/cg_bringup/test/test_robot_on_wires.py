@@ -102,17 +102,7 @@ zeroed_at: '%s'
 def record(folder, model_file, seed):
     """One experiment through the wires; the bag."""
     bag = folder / f'swing_{seed}'
-    words = (
-        '--model',
-        str(model_file),
-        '--setup',
-        SETUP,
-        '--state',
-        '0',
-        '0',
-        '--seed',
-        str(seed),
-    )
+    words = f'--model {model_file} --state 0 0 --seed {seed}'.split()
     nodes = robot_nodes(options_in(folder))
     del nodes['observer'], nodes['balance']
     nodes['safety_gate'] = replace(nodes['safety_gate'], parameters={
@@ -123,7 +113,7 @@ def record(folder, model_file, seed):
         'seed': seed,
     }, ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),))  # fmt: skip
     nodes['recorder'] = NodeOf('cg_sysid', 'recorder_node', {'bag': str(bag)}, ending=10.0)
-    with connected(nodes, folder, *words) as (robot, person, _):
+    with connected(nodes, folder, *words, '--setup', SETUP) as (robot, person, _):
         robot.ask('can_jitter_ms 1')
         robot.ask('usb_ms 4')
         note = person.node.create_publisher(String, topics.EXPERIMENT, LATCHED_QOS)

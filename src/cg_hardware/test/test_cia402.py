@@ -18,7 +18,7 @@ from cg_hardware.drive.cia402 import State
 )  # fmt: skip
 def test_states(word, state):
     # Bit 5 is the quick stop's, low while it acts; bit 4, voltage, and the upper half are free.
-    assert cia402.state_of(word) == (state if word != 0x0217 else State.QUICK_STOP)
+    assert cia402.state_of(word) == state
 
 
 def test_a_word_that_is_no_state_is_refused():

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import can
 import canopen
+from canopen.sdo.exceptions import SdoError
 
 from cg_hardware.drive import cia402
 from cg_hardware.drive.cia402 import State
@@ -36,7 +37,6 @@ PRESENT = 402  # low half of the device type
 LATEST_NS = 2_800_000  # ns that an answer takes at most; an older SYNC's is lost
 SILENCE_S = 0.015  # s without an answer after which the drive counts as lost
 PATIENCE_MS = 18  # for which the drive waits for the host's heartbeat and torque: 20 less a cycle
-DRIVE_HEARTBEAT_MS = 10
 OPERATIONAL = 0x05
 FAULTS = (State.REACTING, State.FAULT)
 
@@ -127,13 +127,7 @@ class CanDrive:
         self._open(bus)
         try:
             rated = self._set_up() * gear
-        except (
-            canopen.sdo.SdoCommunicationError,
-            canopen.sdo.SdoAbortedError,
-            can.CanError,
-            OSError,
-            struct.error,
-        ) as error:
+        except (SdoError, can.CanError, OSError) as error:
             self.close()
             raise DriveError(f'drive {node} on {told(bus)}: {error}') from error
         self.scale = Scale(rated, sign)
@@ -160,7 +154,6 @@ class CanDrive:
         if kind & 0xFFFF != PRESENT:
             raise OSError(f'is no CiA 402 drive: its device type is 0x{kind:08x}')
         self._remote.nmt.send_command(0x80)  # pre-operational: mappings may change
-        self._write(0x1017, 0, DRIVE_HEARTBEAT_MS, 2)
         self._write(0x1016, 1, HOST << 16 | PATIENCE_MS, 4)
         self._write(cia402.ABORT_CONNECTION, 0, 1, 2)
         self._map(0x1400, 0x1600, 0x200 + self.node,

@@ -11,13 +11,12 @@ from one to the next by the controlword:
 from enum import Enum
 
 CONTROLWORD, STATUSWORD = 0x6040, 0x6041
-MODE, MODE_DISPLAY, CYCLIC_TORQUE = 0x6060, 0x6061, 10
+MODE, CYCLIC_TORQUE = 0x6060, 10
 TARGET_TORQUE, ACTUAL_TORQUE = 0x6071, 0x6077  # int16, per mille of the rated torque
 RATED_TORQUE = 0x6076  # uint32, mN m
 POSITION = 0x6064  # int32, counts
 INPUTS = 0x60FD  # uint32, digital; the upper half is free for what is wired to them
 ABORT_CONNECTION = 0x6007  # what the drive does when the wire is silent; 1 is a fault
-ERROR_CODE = 0x603F
 PER_MILLE = 1000
 LARGEST_TARGET = 32767
 
@@ -48,7 +47,7 @@ _TABLE = (
 )
 
 DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE = 0x00, 0x06, 0x07, 0x0F
-QUICK_STOP, FAULT_RESET = 0x02, 0x80
+FAULT_RESET = 0x80
 
 
 def state_of(statusword: int) -> State:

@@ -48,6 +48,7 @@ STEP = 0.002  # s of the body, and of its sensors
 PRIORITY = -19  # niceness, where it may be had
 BEHIND = 0.5  # s that the emulation may be late before it lets time go
 DRIFT = 40e-6  # of the IMU's quartz
+WRAPS_SOON = 4_294_000_000  # ticks: the counter begins anew within the first half minute
 SHELL = 12_345  # counts at which the encoder wakes up
 FOOT_BITS = {'inner': 1 << 16, 'outer': 1 << 17}  # of the drive's inputs, a foot switch each
 GIMBAL = (0.012, -0.7)  # rad: roll and yaw of an IMU that is mounted as people mount things
@@ -75,9 +76,7 @@ class EmulatedRobot:
         self.imu_line: Pty | None = Pty(folder / 'imu')
         self.can_line: Pty | None = Pty(folder / 'can')
         self._can = SerialCan(self.can_line)
-        self.imu = Gx3Device(
-            drift=DRIFT, timer=4_294_000_000
-        )  # wraps within the first half minute
+        self.imu = Gx3Device(drift=DRIFT, timer=WRAPS_SOON)
         self.drive = Cia402Device()
         self._greeted = False
         self._hip, self._hip_rate = self._plant.measure().outputs['hip_angle'], 0.0
