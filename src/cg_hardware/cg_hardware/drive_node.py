@@ -258,7 +258,12 @@ class DriveNode(Node):
             self._warn(f'torque command: {doubt}')
 
     def on_enable(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """A person wants torque: out of a fault as well."""
+        """A person wants torque: out of a fault as well.
+
+        A drive that was switched off has lost its set-up: it is looked for anew.
+        """
+        if self.drive is not None and self.drive.state is None:
+            self._lose('the drive is silent and is looked for anew')
         response.success = self.drive is not None
         response.message = self._problem or 'the drive is led to operation enabled'
         if self.drive is not None:

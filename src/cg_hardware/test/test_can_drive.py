@@ -119,6 +119,23 @@ def test_a_drive_that_falls_silent_is_given_up(robot, drive):
     assert not drive.wanted
 
 
+def test_a_drive_that_was_switched_off_is_set_up_anew(robot, drive):
+    enabled(drive)
+    robot.ask('drive_off')
+    assert spin(drive, 1.0, until=lambda: not drive.wanted)
+    robot.ask('drive_on')
+    spin(drive, 0.2)
+    assert drive.state is None  # its mapping is gone
+    drive.close()
+    again = CanDrive(robot.bus, node=1)
+    try:
+        enabled(again, 4.0)
+        spin(again, 0.05, 4.0)
+        assert robot.report()['acting'] == 100
+    finally:
+        again.close()
+
+
 def test_a_bus_that_is_pulled_is_an_error_and_can_be_closed(robot, drive):
     enabled(drive, 4.0)
     spin(drive, 0.1, 4.0)

@@ -305,12 +305,13 @@ class CanDrive:
         return time.monotonic() - self._enabling_since > 0.1
 
     def close(self) -> None:
-        """Leave the drive without torque, and the bus."""
+        """Leave the drive without torque, and the bus; once more does nothing."""
         # Where the bus is gone the drive's own watch sees to it.
-        with contextlib.suppress(can.CanError, OSError):
+        gone = contextlib.suppress(can.CanError, OSError, RuntimeError)
+        with gone:
             self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
             self._network.send_message(SYNC, b'')
-        with contextlib.suppress(can.CanError, OSError, RuntimeError):
+        with gone:
             self._network.disconnect()
 
 
