@@ -56,12 +56,23 @@ ACTUATOR = Mapping({
     'limit': Key(QUANTITY, 'largest torque either way; the drive clips to it, controllers and '
                  'planner stay below it', default=None, unit='N m; N along a rail'),
 })  # fmt: skip
+ROBOT = Mapping({
+    'urdf': Key(Text(), 'the URDF itself; `cg new-robot` writes what matters of it'),
+    'driven': Key(
+        ListOf(NAME), 'joints with a drive; all that move by themselves if absent', default=None,
+    ),
+    'rates': Key(Flag(), 'true: rates of the joints are measured as well', default=False),
+})  # fmt: skip
 SCHEMA = Mapping({
     'format': Key(Text((FORMAT,)), 'form of the file'),
     'name': Key(NAME, 'name of the robot'),
     'mechanism': Key(NAME, 'rigid bodies and joints, one of those below'),
     'description': Key(Text(), 'free text', default=''),
-    'parameters': Key(MapOf(QUANTITY), 'every number of the mechanism'),
+    'robot': Key(ROBOT, 'the robot of the mechanism `urdf`; no other has one', default=None),
+    'parameters': Key(
+        MapOf(QUANTITY), 'every number of the mechanism; of a `urdf` those that differ from it',
+        default={},
+    ),
     'effects': Key(ListOf(EFFECT), 'what the robot has beyond rigid bodies, in the order in '
                    'which it acts', default=()),
     'sensors': Key(MapOf(SENSOR), 'output channel -> how well it measures', default={}),
@@ -124,6 +135,7 @@ class ModelFile:
         actuators: Channel -> quantities ('limit').
         description: Free text.
         provenance: Free mapping: where the file comes from.
+        robot: What `ROBOT` says, of the mechanism 'urdf' alone.
     """
 
     name: str
@@ -134,6 +146,7 @@ class ModelFile:
     actuators: dict[str, dict[str, Quantity]] = field(default_factory=dict)
     description: str = ''
     provenance: dict[str, Any] = field(default_factory=dict)
+    robot: dict[str, Any] | None = None
 
 
 def parse(text: str, where: str = 'model') -> ModelFile:
@@ -155,6 +168,7 @@ def parse(text: str, where: str = 'model') -> ModelFile:
         actuators={channel: _quantities(entry) for channel, entry in tree['actuators'].items()},
         description=tree['description'],
         provenance=dict(tree['provenance']),
+        robot=tree['robot'],
     )
 
 
@@ -167,6 +181,25 @@ def load(path: str | Path) -> ModelFile:
     return parse(read_text(path, ModelFileError), str(path))
 
 
+class _Block(str):
+    """A text of many lines that stands in the file as it is."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Safe YAML that knows blocks."""
+
+
+_Dumper.add_representer(
+    _Block, lambda dumper, text: dumper.represent_scalar('tag:yaml.org,2002:str', text, style='|')
+)
+
+
+def _robot(robot: dict[str, Any]) -> dict[str, Any]:
+    """What `ROBOT` reads, without what is by default."""
+    said = {name: robot[name] for name in ('driven', 'rates') if robot.get(name)}
+    return {**said, 'urdf': _Block(robot['urdf'])}
+
+
 def dump(model: ModelFile) -> str:
     """The text of a model file; `parse` reads it back to an equal `ModelFile`."""
     tree: dict[str, Any] = {
@@ -174,6 +207,7 @@ def dump(model: ModelFile) -> str:
         'name': model.name,
         'mechanism': model.mechanism,
         'description': model.description,
+        **({'robot': _robot(model.robot)} if model.robot else {}),
         'parameters': {name: q.to_yaml() for name, q in model.parameters.items()},
         'effects': [
             {
@@ -193,7 +227,7 @@ def dump(model: ModelFile) -> str:
         },
         'provenance': model.provenance,
     }
-    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=99)
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99)
 
 
 def save(model: ModelFile, path: str | Path) -> None:

@@ -4,6 +4,7 @@ x = (s, ds/dt, z): free coordinates, their rates, extra states of the effects. T
 vector p is the mechanism's parameters, then those of each effect, then those of the springs.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,6 +34,8 @@ class Equations:
         output_delays: Delay of each output in s, shape (ny, 1).
         mass_matrix: Of the free coordinates.
         load: Generalised forces less bias, so that mass_matrix times acceleration is load: (m, 1).
+        acceleration: Symbol of an acceleration of the free coordinates, (m, 1).
+        imbalance: Generalised forces less what that acceleration takes; 0 of the true one: (m, 1).
         energy: Kinetic plus potential energy of bodies and springs in J.
         state_names: Names of x.
         parameter_names: Full names of p.
@@ -53,6 +56,8 @@ class Equations:
     output_delays: ca.SX
     mass_matrix: ca.SX
     load: ca.SX
+    acceleration: ca.SX
+    imbalance: ca.SX
     energy: ca.SX
     state_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
@@ -61,6 +66,35 @@ class Equations:
     coordinates: int
     state_scales: tuple[float, ...]
     largest_step: float
+
+    def rates_by(self, *symbols: ca.SX) -> list[ca.SX]:
+        """Jacobians of the rates.
+
+        Of a mechanism of many joints by its implicit equations: with imbalance(a, x) = 0 and
+        M = -d(imbalance)/da,
+
+            da/dx = M^-1 d(imbalance)/dx,
+
+        which is many times shorter than what differentiating the solution would write out.
+        """
+        m = self.coordinates
+        if m <= 2:
+            return [ca.jacobian(self.rates, by) for by in symbols]
+        every = ca.vertcat(*symbols)
+        by = ca.jacobian(self.imbalance, every)
+        factors = ca.ldl(self.mass_matrix)
+        moving = [c for c in range(by.shape[1]) if by[:, c].nnz()]
+        solved = ca.SX(m, by.shape[1])
+        if moving:
+            solved[:, moving] = ca.ldl_solve(ca.densify(by[:, moving]), *factors)
+        solved = ca.substitute(solved, self.acceleration, self.rates[m : 2 * m])
+        jacobian = ca.vertcat(
+            ca.jacobian(self.rates[:m], every),
+            solved,
+            ca.jacobian(self.rates[2 * m :], every),
+        )
+        edges = np.cumsum([0, *(by.shape[0] for by in symbols)])
+        return [jacobian[:, a:b] for a, b in itertools.pairwise(map(int, edges))]
 
 
 def acting_effects(model: Model) -> tuple[Effect, ...]:
@@ -155,16 +189,23 @@ def assemble(model: Model, setup: Setup) -> Equations:
 
     # Bodies: energies, springs, forces.
     q, v = ca.SX.sym('q', kinematics.basis.shape[0]), ca.SX.sym('v', kinematics.basis.shape[0])
-    up = ca.SX([0, 1])
+    up = mechanism.up(setup)
     for e in effects:
         up = e.up(up, own[e.label])
-    body = Body(mechanism, setup, q, v, by_name, up, foot=ca.SX.zeros(2))
-    body = replace(body, foot=sum((e.foot(body, own[e.label]) for e in effects), body.foot))
-    kinetic, potential = mechanism.energies(q, v, by_name, setup, up, body.foot)
+    body = Body(mechanism, setup, q, v, by_name, up, foot=ca.SX.zeros(mechanism.dimensions))
+    displaced = [e.foot(body, own[e.label]) for e in effects if overrides(e, 'foot')]
+    body = replace(body, foot=sum(displaced, body.foot))
+    a = ca.SX.sym('a', *s.shape)
+    taken = mechanism.inverse_dynamics(q, v, ca.mtimes(kinematics.basis, a), by_name, up)
+    energies = mechanism.energies(q, v, by_name, setup, up, body.foot)
+    # What recursion does not give is derived from the energies.
+    kinetic, potential = energies if taken is None else (ca.SX(0), ca.SX(0))
     for stretch, stiffness in body.springs():
         potential += stiffness * stretch**2 / 2
     force = ca.SX.zeros(q.shape)
-    full = [ca.mtimes(kinematics.basis, s), ca.mtimes(kinematics.basis, ds)]
+    full = [
+        ca.mtimes(kinematics.basis, s) + kinematics.offset, ca.mtimes(kinematics.basis, ds)
+    ]  # fmt: skip
     for e in effects:
         more_kinetic, more_potential = e.energies(body, own[e.label])
         kinetic, potential = kinetic + more_kinetic, potential + more_potential
@@ -178,6 +219,19 @@ def assemble(model: Model, setup: Setup) -> Equations:
     kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
     mass_matrix, bias = manipulator(kinetic, potential, s, ds)
     load = ca.mtimes(kinematics.basis.T, force) - bias
+    imbalance = load - ca.mtimes(mass_matrix, a)
+    energy = kinetic + potential
+    if taken is not None:
+        own_mass = mechanism.mass_matrix(q, by_name)
+        taken, own_mass, own_energy = ca.substitute(
+            [ca.mtimes(kinematics.basis.T, taken),
+             ca.mtimes([kinematics.basis.T, own_mass, kinematics.basis]), sum(energies)],
+            [q, v], full,
+        )  # fmt: skip
+        load -= ca.substitute(taken, a, ca.SX.zeros(a.shape))
+        imbalance -= taken
+        mass_matrix += own_mass
+        energy += own_energy
     acceleration = solve_small(mass_matrix, load)
 
     # Sensors.
@@ -209,7 +263,9 @@ def assemble(model: Model, setup: Setup) -> Equations:
         output_delays=ca.vertcat(*output_delays.values()),
         mass_matrix=mass_matrix,
         load=load,
-        energy=kinetic + potential,
+        acceleration=a,
+        imbalance=imbalance,
+        energy=energy,
         state_names=(
             *kinematics.names,
             *(f'd{name}/dt' for name in kinematics.names),

@@ -48,8 +48,7 @@ def jacobians(compiled: CompiledModel) -> ca.Function:
     """x, u, p -> A, B, C, D, rates, outputs. `Function.map` makes it one call per trajectory."""
     e = compiled.equations
     expressions = [
-        ca.jacobian(e.rates, e.x),
-        ca.jacobian(e.rates, e.u),
+        *e.rates_by(e.x, e.u),
         ca.jacobian(e.outputs, e.x),
         ca.jacobian(e.outputs, e.u),
         e.rates,

@@ -103,8 +103,10 @@ class Model:
     def from_file(cls, file: ModelFile, where: str = 'model') -> 'Model':
         """Give meaning to a model file: known names, right units, values in range."""
         try:
-            body = mechanism(file.mechanism)
-            quantities = _match(body.parameters, file.parameters, 'parameters', needed=True)
+            body = mechanism(file.mechanism, file.robot)
+            quantities = _match(
+                body.parameters, file.parameters, 'parameters', needed=file.robot is None
+            )
             effects: list[Effect] = []
             for index, entry in enumerate(file.effects):
                 place = f'effects[{index}]'
@@ -151,10 +153,16 @@ class Model:
 
     def to_file(self) -> ModelFile:
         """The content that `from_file` reads back."""
+        robot = self.mechanism.robot()
         return ModelFile(
             name=self.name,
             mechanism=self.mechanism.name,
-            parameters={p.name: self.quantities[p.name] for p in self.mechanism.parameters},
+            robot=robot,
+            parameters={
+                p.name: self.quantities[p.name]
+                for p in self.mechanism.parameters
+                if robot is None or self.quantities[p.name] != _usual(p)
+            },
             effects=tuple(
                 EffectEntry(
                     effect.name,
@@ -291,8 +299,16 @@ def _says_nothing(declared: Parameter, q: Quantity) -> bool:
     It stays out of files: a law that gets a shape more is still the law by whose hash bags and
     trees know the model.
     """
-    usual = Quantity(declared.default, declared.unit, fixed=not declared.free)
-    return bool(declared.leeway) and declared.neutral is not None and q == usual
+    return bool(declared.leeway) and declared.neutral is not None and q == _usual(declared)
+
+
+def _usual(p: Parameter) -> Quantity:
+    """What a file means that does not name a parameter.
+
+    A number of a URDF's body is believed as far as its scale.
+    """
+    believed = p.scale if p.belief else None
+    return Quantity(p.default, p.unit, believed, fixed=not p.free)
 
 
 def _entries_read_only(channels):
@@ -312,7 +328,7 @@ def _match(
         if p.name not in given:
             if needed:
                 raise ModelError(f'{place}.{p.name} ({p.unit}, {p.description}) is missing')
-            found[p.name] = Quantity(p.default, p.unit, fixed=not p.free)
+            found[p.name] = _usual(p)
             continue
         q = given[p.name]
         _same_unit(f'{place}.{p.name}', q.unit, p.unit)

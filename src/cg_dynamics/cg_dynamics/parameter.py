@@ -47,6 +47,8 @@ class Parameter:
         ends: The ends of its range, 'lower', 'upper' or both, at which physics ends as well: a
             share that is none or all, a pulse too short for its shape to matter. A value there is
             a finding as any other.
+        belief: True where a model that does not state a value believes the neutral one, with
+            `scale` as standard deviation.
     """
 
     name: str
@@ -65,6 +67,7 @@ class Parameter:
     along: str = ''
     smoothing: bool = False
     ends: tuple[str, ...] = ()
+    belief: bool = False
 
     def sliding(self) -> 'Parameter':
         """This declaration for a joint that slides."""

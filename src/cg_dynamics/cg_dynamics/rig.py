@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Any
 
-from cg_description.schema import Flag, Key, ListOf, Mapping, Number, Text
+from cg_description.schema import Flag, Key, ListOf, MapOf, Mapping, Number, Text
 from cg_dynamics.errors import SetupError
 
+DOWN = (0.0, 0.0, -1.0)
 STANCES = ('inner', 'outer')
 FIXTURES = ('none', 'inner_fixed', 'outer_fixed', 'legs_tied')
 SPRING = Mapping({
@@ -20,6 +21,14 @@ SCHEMA = Mapping({
     'fixture': Key(Text(FIXTURES), default='none'),
     'springs': Key(ListOf(SPRING), default=()),
     'on_blocks': Key(Flag(), default=True),
+    'locked': Key(
+        MapOf(Number()), 'joint of a URDF that something holds -> where', default={},
+        unit='rad or m',
+    ),
+    'gravity': Key(
+        ListOf(Number(), 3, 3), 'of a URDF: which way things fall in the frame of its root, '
+        '[x, y, z]; the length does not count', default=DOWN,
+    ),
 })  # fmt: skip
 
 
@@ -50,10 +59,14 @@ class Setup:
     fixture: str = 'none'
     springs: tuple[Spring, ...] = ()
     on_blocks: bool = True
+    locked: tuple[tuple[str, float], ...] = ()
+    gravity: tuple[float, float, float] = DOWN
 
     def __post_init__(self):
         _one_of('stance', self.stance, STANCES)
         _one_of('fixture', self.fixture, FIXTURES)
+        if not any(self.gravity):
+            raise SetupError('setup.gravity: [0, 0, 0] is no direction')
         if self.fixture in ('inner_fixed', 'outer_fixed') and not self.fixture.startswith(
             self.stance
         ):
@@ -80,10 +93,16 @@ class Setup:
         values['springs'] = tuple(
             Spring(**{**spring, 'anchor': tuple(spring['anchor'])}) for spring in values['springs']
         )
+        values['locked'] = tuple(sorted(values['locked'].items()))
+        values['gravity'] = tuple(values['gravity'])
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
         """The mapping that `from_dict` reads back."""
+        only_of_urdfs = {
+            **({'locked': dict(self.locked)} if self.locked else {}),
+            **({'gravity': list(self.gravity)} if self.gravity != DOWN else {}),
+        }
         return {
             'stance': self.stance,
             'fixture': self.fixture,
@@ -98,6 +117,7 @@ class Setup:
                 for spring in self.springs
             ],
             'on_blocks': self.on_blocks,
+            **only_of_urdfs,
         }
 
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -19,15 +19,17 @@ class Kinematics:
 
     Attributes:
         names: Names of the free coordinates s.
-        basis: q = basis s, shape (n, m): which full coordinate follows which free one.
+        basis: q = basis s + offset, shape (n, m): which full coordinate follows which free one.
+        offset: Where coordinates are that do not move, shape (n, 1), or 0 for all.
     """
 
     names: tuple[str, ...]
     basis: ca.DM
+    offset: ca.DM = field(default_factory=lambda: ca.DM(0))
 
 
 class Mechanism(ABC):
-    """A planar rigid-body mechanism in the textbook sense, M(q) dv/dt + b(q, v) = B u.
+    """A rigid-body mechanism in the textbook sense, M(q) dv/dt + b(q, v) = B u.
 
     Attributes:
         name: Name in model files.
@@ -42,6 +44,7 @@ class Mechanism(ABC):
         bodies: Bodies that a payload or a spring can be tied to.
         parameters: Declared parameters.
         sliding: Coordinates that are lengths in m; the others are angles in rad.
+        dimensions: Of the space in which it moves: 2 in the x-z plane, 3.
     """
 
     name: str
@@ -54,6 +57,16 @@ class Mechanism(ABC):
     bodies: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     sliding: tuple[str, ...] = ()
+    dimensions: int = 2
+
+    @property
+    def identity(self) -> str:
+        """Name under which what was compiled for a mechanism is found again."""
+        return self.name
+
+    def robot(self) -> dict[str, Any] | None:
+        """What a model file has to say of it beyond its name (model_file.ROBOT)."""
+        return None
 
     def slides(self, joint: str) -> bool:
         """Whether a joint moves along a line: its position is in m, what acts on it in N."""
@@ -88,7 +101,7 @@ class Mechanism(ABC):
             v: Their rates.
             p: Parameters by name.
             setup: The set-up.
-            up: Unit vector (x, z) against gravity; (0, 1) on level ground.
+            up: Unit vector against gravity; (x, z) = (0, 1) on level ground.
             foot: Where the foot that stands is moved, (x, z) in m; only a compass gait has one.
         """
 
@@ -105,6 +118,24 @@ class Mechanism(ABC):
     def kinematics(self, setup: Setup) -> Kinematics:
         """Free coordinates in this set-up; all of them unless a mechanism knows fixtures."""
         return Kinematics(self.coordinates, ca.DM.eye(len(self.coordinates)))
+
+    def up(self, setup: Setup) -> ca.SX:
+        """Unit vector against gravity where nothing tilts the ground."""
+        return ca.SX([0, 1])
+
+    def inverse_dynamics(
+        self, q: ca.SX, v: ca.SX, a: ca.SX, p: Symbols, up: ca.SX
+    ) -> ca.SX | None:
+        """Generalised forces M a + b that an acceleration a takes, shape (n, 1).
+
+        A mechanism of many joints gives them, and `mass_matrix`, by recursion; for None they are
+        derived from the energies.
+        """
+        return None
+
+    def mass_matrix(self, q: ca.SX, p: Symbols) -> ca.SX:
+        """M(q), shape (n, n), of a mechanism that has `inverse_dynamics`."""
+        raise NotImplementedError
 
     def consistency(self, p: Mapping[str, Any]) -> list[Any]:
         """Expressions that are positive if and only if real bodies have these parameters."""

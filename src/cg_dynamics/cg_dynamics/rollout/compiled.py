@@ -100,7 +100,7 @@ class CompiledModel:
         )
         self.f = ca.Function('f', [e.x, e.u, e.p], [e.rates], ['x', 'u', 'p'], ['dx'])
         self.h = ca.Function('h', [e.x, e.u, e.p], [e.outputs], ['x', 'u', 'p'], ['y'])
-        self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], [ca.jacobian(e.rates, e.x)])
+        self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], e.rates_by(e.x))
         self.has_delays = not delays.is_zero()
         self._c: Any = (NativeRollout if native else InterpretedRollout)(equations, free)
 
@@ -357,12 +357,13 @@ def compile_model(
             if parameter.free and ('.' not in name or name.rpartition('.')[0] in acting)
         )
     key = (
-        model.mechanism.name,
+        model.mechanism.identity,
         tuple((e.name, e.at) for e in model.effects),
         tuple(e.label for e in acting_effects(model)),
         setup.stance,
         setup.fixture,
         tuple(spring.body for spring in setup.springs),
+        tuple(name for name, _ in setup.locked),
         free,
     )
     if key not in _built:

@@ -241,7 +241,7 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
         UnsupportedError: for an operation that has no vector form.
     """
     symbols = symbols_of(e, free)
-    A, B, P = (ca.jacobian(e.rates, by) for by in (e.x, e.u, symbols))
+    A, B, P = e.rates_by(e.x, e.u, symbols)
     C, D = (ca.jacobian(e.outputs, by) for by in (e.x, symbols))
     rates, shared_f = _vectorised(e, 'rates_by', 'prepare_rates', ca.densify(e.rates), A, B, P)
     outputs, shared_h = _vectorised(e, 'outputs_by', 'prepare_outputs', C, D)

@@ -1,0 +1,484 @@
+"""Any tree of joints on a fixed base, from its URDF: recursive Newton-Euler, link by link.
+
+Each joint that moves carries a body: its child link and all links fixed to that. In the body's own
+frame, with mass m, first moment h = m c and inertia I about the frame's origin,
+
+    f = m a + dw x h + w x (w x h),    n = I dw + w x (I w) + h x a                      (NE)
+
+where w, dw and a are the frame's angular velocity, angular acceleration and acceleration less
+gravity. What a joint has to give is f along or n about its axis, once the bodies it carries have
+been added up: tau = ID(q, v, dv/dt). M(q) comes from composite bodies (CRB). Both are checked
+against MuJoCo and Drake (test_urdf_oracles.py).
+
+The numbers of a body are how far its mass distribution is from that in the URDF: an affine image of
+it, x -> c + G (t + D G^-1 (x - c)), and heavier by a ratio:
+
+    m = mu m0,    c = c0 + G t,    S = G D D' G',    S0 = G G'                           (BODY)
+
+with S the second moment of a unit mass about its centre and D upper triangular. G is the Cholesky
+factor of S0, so that t and D count in radii of gyration. Whatever the numbers, real bodies have
+them: this is the pseudo-inertia's Cholesky factor [Rucker & Wensing 2022, RA-L 7(2)], seen from
+the URDF.
+"""
+
+import hashlib
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from cg_description.robot_description import Inertial, Joint, RobotDescription, rotation
+from cg_dynamics.errors import ModelError
+from cg_dynamics.mechanisms.mechanism import Kinematics, Mechanism, Symbols
+from cg_dynamics.parameter import Parameter
+from cg_dynamics.rig import Setup
+
+BELIEF = 0.15  # standard deviation of each of a body's numbers, [1]
+NUMBERS = (
+    # name, description, neutral value, range
+    ('mass', 'mass over that in the URDF', 1.0, (1e-2, 1e2)),
+    *((f'shift_{a}', f'centre of mass along {a}, in radii of gyration', 0.0, (-20.0, 20.0))
+      for a in 'xyz'),
+    *((f'stretch_{a}', f'extent along {a} over that in the URDF', 1.0, (2e-2, 50.0))
+      for a in 'xyz'),
+    *((f'shear_{a}', f'shear of the body in its {a} plane', 0.0, (-10.0, 10.0))
+      for a in ('xy', 'xz', 'yz')),
+)  # fmt: skip
+THINNEST = 1e-3  # m, radius of gyration of a body that has none in its URDF
+ROUNDED = 0.02  # share by which a principal moment may exceed the sum of the others by rounding
+PROBES = 40  # motions at which the numbers are looked at that could matter
+DETERMINED = 1e-8  # relative size of what a motion has to show of a number
+
+
+class Urdf(Mechanism):
+    """A robot by its description.
+
+    Args:
+        description: Links and joints.
+        driven: Names of the joints on which something acts; by default all that move by
+            themselves.
+        rates: Whether rates of joints are measured too.
+
+    Raises:
+        ModelError: if nothing moves, a driven joint does not, or no real body has an inertia.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        driven: Sequence[str] | None = None,
+        rates: bool = False,
+    ):
+        self.name, self.dimensions = 'urdf', 3
+        self.description, self.rates = description, rates
+        self.moving = description.moving
+        free = [joint.name for joint in description.independent]
+        if not free:
+            raise ModelError(f'URDF {description.name!r}: no joint moves')
+        self.driven = tuple(free if driven is None else driven)
+        for name in self.driven:
+            if name not in free:
+                raise ModelError(
+                    f'driven: {name!r} is no joint that moves by itself; there are: '
+                    f'{", ".join(free)}'
+                )
+        rows = {name: tuple(float(name == other) for other in free) for name in free}
+        self.coordinates = tuple(free)
+        self.joints = {name: rows[name] for name in self.driven}
+        self.sliding = tuple(j.name for j in description.independent if j.slides)
+        self.inputs = tuple(f'{name}_effort' for name in self.driven)
+        units = ['m' if name in self.sliding else 'rad' for name in free]
+        self.outputs = tuple(f'{name}_position' for name in free)
+        self.output_units = tuple(units)
+        self.sensor_kinds = dict.fromkeys(self.outputs, 'encoder')
+        if rates:
+            rates_of = tuple(f'{name}_velocity' for name in free)
+            self.outputs += rates_of
+            self.output_units += tuple(f'{unit}/s' for unit in units)
+            self.sensor_kinds |= dict.fromkeys(rates_of, 'tachometer')
+        self._bodies = _bodies(description)
+        self.bodies = tuple(_place(description, joint) for joint in self.moving)
+        self.parameters = (
+            *(p for body in self._bodies for p in body.parameters()),
+            Parameter('gravity', 'm/s^2', 'acceleration of gravity', 0.0, 30.0, 9.81, free=False),
+        )
+        self.parameters = self._determined()
+
+    # Models, sensors and compiled code of equal robots are the same.
+    @cached_property
+    def identity(self) -> str:
+        """Name of this very robot: two that differ in a number or a joint have other ones."""
+        said = f'{self.description.text()}|{self.driven}|{self.rates}'
+        return f'urdf:{hashlib.sha256(said.encode()).hexdigest()[:16]}'
+
+    def __eq__(self, other):
+        return isinstance(other, Urdf) and self.identity == other.identity
+
+    def __hash__(self):
+        return hash(self.identity)
+
+    def __reduce__(self):
+        return Urdf, (self.description, self.driven, self.rates)
+
+    def robot(self):
+        """Its URDF, and what that does not say."""
+        every = self.driven == self.coordinates
+        return {
+            'urdf': self.description.text(),
+            'driven': None if every else list(self.driven),
+            'rates': self.rates,
+        }
+
+    def up(self, setup: Setup) -> ca.SX:
+        """Against the set-up's gravity, in the frame of the root."""
+        return ca.SX(ca.DM([-x / math.hypot(*setup.gravity) for x in setup.gravity]))
+
+    def kinematics(self, setup: Setup) -> Kinematics:
+        """All joints but those that the set-up locks."""
+        locked = dict(setup.locked)
+        for name in locked:
+            if name not in self.coordinates:
+                raise ModelError(
+                    f'setup.locked: {name!r} is no joint that moves by itself; there are: '
+                    f'{", ".join(self.coordinates)}'
+                )
+        free = [k for k, name in enumerate(self.coordinates) if name not in locked]
+        if not free:
+            raise ModelError('setup.locked: nothing is left to move')
+        return Kinematics(
+            tuple(self.coordinates[k] for k in free),
+            ca.DM(np.eye(len(self.coordinates))[:, free]),
+            ca.DM([locked.get(name, 0.0) for name in self.coordinates]),
+        )
+
+    def energies(self, q, v, p: Symbols, setup, up, foot=None):
+        """T = v'M v / 2; V = sum m g (up . c)."""
+        kinetic = ca.mtimes([v.T, self.mass_matrix(q, p), v]) / 2
+        potential = ca.SX(0)
+        frames = self._frames(q)
+        for body, joint in zip(self._bodies, self.moving, strict=True):
+            m, h, _ = body.symbols(p)
+            turn, origin = frames[joint.child]
+            potential += p['gravity'] * ca.dot(up, m * origin + ca.mtimes(turn, h))
+        return kinetic, potential
+
+    def point(self, body, distance, q, p, setup):
+        """World position of the point of a link at `distance`, (x, y, z) in its frame."""
+        turn, origin = self._frames(q)[body]
+        return origin + ca.mtimes(turn, distance)
+
+    def sensors(self, q, v):
+        """Positions, and rates where they are measured."""
+        read = dict(zip(self.outputs, ca.vertsplit(q), strict=False))
+        if self.rates:
+            read |= dict(zip(self.outputs[len(self.coordinates) :], ca.vertsplit(v), strict=True))
+        return read
+
+    def inverse_dynamics(self, q, v, a, p: Symbols, up):
+        """(NE), from the base out and back."""
+        to_tree, offset = self._tree
+        q, v, a = ca.mtimes(to_tree, q) + offset, ca.mtimes(to_tree, v), ca.mtimes(to_tree, a)
+        still = ca.SX.zeros(3)
+        motion = {self.description.root: (still, still, up * p['gravity'])}
+        place = {joint.name: k for k, joint in enumerate(self.moving)}
+        turns = {}
+        for joint in self.description.joints:
+            w, dw, acceleration = motion[joint.parent]
+            turn, origin = _placed(joint, q[place[joint.name]] if joint.name in place else None)
+            turns[joint.name] = turn, origin
+            acceleration = acceleration + ca.cross(dw, origin) + ca.cross(w, ca.cross(w, origin))
+            w, dw, acceleration = (ca.mtimes(turn.T, x) for x in (w, dw, acceleration))
+            if joint.name in place:
+                k, axis = place[joint.name], ca.DM(joint.axis)
+                if joint.slides:
+                    acceleration += axis * a[k] + 2 * ca.cross(w, axis) * v[k]
+                else:
+                    dw = dw + ca.cross(w, axis) * v[k] + axis * a[k]
+                    w = w + axis * v[k]
+            motion[joint.child] = w, dw, acceleration
+        loads = dict.fromkeys(self.description.links, (still, still))
+        inertias = {j.child: b.symbols(p) for j, b in zip(self.moving, self._bodies, strict=True)}
+        needed = [ca.SX(0)] * len(self.moving)
+        for joint in reversed(self.description.joints):
+            force, moment = loads[joint.child]
+            if joint.child in inertias:
+                m, h, inertia = inertias[joint.child]
+                w, dw, acceleration = motion[joint.child]
+                force = force + m * acceleration + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
+                moment = (
+                    moment
+                    + ca.mtimes(inertia, dw)
+                    + ca.cross(w, ca.mtimes(inertia, w))
+                    + ca.cross(h, acceleration)
+                )
+                needed[place[joint.name]] = ca.dot(
+                    ca.DM(joint.axis), force if joint.slides else moment
+                )
+            turn, origin = turns[joint.name]
+            force, moment = ca.mtimes(turn, force), ca.mtimes(turn, moment)
+            f, n = loads[joint.parent]
+            loads[joint.parent] = f + force, n + moment + ca.cross(origin, force)
+        return ca.mtimes(to_tree.T, ca.vertcat(*needed))
+
+    def mass_matrix(self, q, p: Symbols):
+        """(CRB): each joint moves all that it carries, as one body."""
+        to_tree, offset = self._tree
+        q = ca.mtimes(to_tree, q) + offset
+        place = {joint.name: k for k, joint in enumerate(self.moving)}
+        nothing = (ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3))
+        carried = dict.fromkeys(self.description.links, nothing)
+        turns = {
+            joint.name: _placed(joint, q[place[joint.name]] if joint.name in place else None)
+            for joint in self.description.joints
+        }
+        for joint, body in zip(self.moving, self._bodies, strict=True):
+            carried[joint.child] = body.symbols(p)
+        matrix = ca.SX.zeros(len(self.moving), len(self.moving))
+        above = {joint.child: joint for joint in self.description.joints}
+        for joint in reversed(self.description.joints):
+            m, h, inertia = carried[joint.child]
+            if joint.name in place:
+                k, axis = place[joint.name], ca.DM(joint.axis)
+                if joint.slides:
+                    force, moment = axis * m, ca.cross(h, axis)
+                else:
+                    force, moment = ca.cross(axis, h), ca.mtimes(inertia, axis)
+                matrix[k, k] = ca.dot(axis, force if joint.slides else moment)
+                down = joint
+                while down.parent in above:
+                    turn, origin = turns[down.name]
+                    force, moment = ca.mtimes(turn, force), ca.mtimes(turn, moment)
+                    moment = moment + ca.cross(origin, force)
+                    down = above[down.parent]
+                    if down.name in place:
+                        axis = ca.DM(down.axis)
+                        entry = ca.dot(axis, force if down.slides else moment)
+                        matrix[k, place[down.name]] = matrix[place[down.name], k] = entry
+            turn, origin = turns[joint.name]
+            m0, h0, inertia0 = carried[joint.parent]
+            moved = ca.mtimes(turn, h)
+            arm, offset_of = ca.skew(origin), ca.skew(moved)
+            carried[joint.parent] = (
+                m0 + m,
+                h0 + moved + m * origin,
+                inertia0
+                + ca.mtimes([turn, inertia, turn.T])
+                - m * ca.mtimes(arm, arm)
+                - ca.mtimes(arm, offset_of)
+                - ca.mtimes(offset_of, arm),
+            )
+        return ca.mtimes([to_tree.T, matrix, to_tree])
+
+    def inertials(self, values) -> dict[str, Inertial]:
+        """What each body weighs by these parameters: name of its link -> inertia of all that is
+        fixed to that link, in its frame.
+        """  # noqa: D205
+        return {
+            joint.child: body.inertial(values)
+            for joint, body in zip(self.moving, self._bodies, strict=True)
+            if body.mass > 0
+        }
+
+    @cached_property
+    def _tree(self) -> tuple[ca.DM, ca.DM]:
+        """Positions of all joints that move, those that follow as well: T q + offset."""
+        free = {name: k for k, name in enumerate(self.coordinates)}
+        follow, offset = np.zeros((len(self.moving), len(free))), np.zeros(len(self.moving))
+        for k, joint in enumerate(self.moving):
+            leader, ratio, offset[k] = joint.mimic or (joint.name, 1.0, 0.0)
+            follow[k, free[leader]] = ratio
+        return ca.DM(follow), ca.DM(offset)
+
+    def _frames(self, q) -> dict[str, tuple[ca.SX, ca.SX]]:
+        """Link -> its orientation, shape (3, 3), and origin, (3, 1), in the root's frame."""
+        to_tree, offset = self._tree
+        q = ca.mtimes(to_tree, q) + offset
+        place = {joint.name: k for k, joint in enumerate(self.moving)}
+        frames = {self.description.root: (ca.SX.eye(3), ca.SX.zeros(3))}
+        for joint in self.description.joints:
+            turn, origin = _placed(joint, q[place[joint.name]] if joint.name in place else None)
+            before, at = frames[joint.parent]
+            frames[joint.child] = ca.mtimes(before, turn), at + ca.mtimes(before, origin)
+        return frames
+
+    def _determined(self) -> tuple[Parameter, ...]:
+        """The parameters; those that no motion of this robot shows are not free.
+
+        The dynamics are linear in the inertias of the bodies, in fewer combinations of them (base
+        parameters) than there are. Of the numbers here a set is left free, each chosen as the one
+        that the motions show best beside those before it, that spans what all of them do.
+        """
+        effect = self._by_parameters(np.random.default_rng(0))
+        count = effect.shape[1]
+        remaining, chosen = effect.copy(), []
+        largest = np.linalg.norm(effect, axis=0).max(initial=0.0)
+        for _ in range(count):
+            size = np.linalg.norm(remaining, axis=0)
+            best = int(np.argmax(size))
+            if not size[best] > DETERMINED * largest:
+                break
+            chosen.append(best)
+            unit = remaining[:, best] / size[best]
+            remaining -= np.outer(unit, unit @ remaining)
+        return tuple(
+            p if k in chosen or k >= count else replace(p, free=False, belief=False)
+            for k, p in enumerate(self.parameters)
+        )
+
+    def _by_parameters(self, random: np.random.Generator) -> np.ndarray:
+        """Change of torques at some motions with each number: (motions times joints, numbers)."""
+        n = len(self.coordinates)
+        p = ca.SX.sym('p', len(self.parameters))
+        names = [parameter.name for parameter in self.parameters]
+        symbols = dict(zip(names, ca.vertsplit(p), strict=True))
+        q, v, a = (ca.SX.sym(name, n) for name in 'qva')
+        torque = self.inverse_dynamics(q, v, a, symbols, self.up(Setup()))
+        numbers = len(self.parameters) - 1
+        by = ca.Function('by', [q, v, a, p], [ca.jacobian(torque, p[:numbers])])
+        nominal = np.array([parameter.default for parameter in self.parameters])
+        rows = []
+        for _ in range(PROBES):
+            motion = (random.uniform(-3, 3, n), random.normal(0, 2, n), random.normal(0, 5, n))
+            rows.append(np.asarray(by(*motion, nominal)))
+        return np.vstack(rows)
+
+
+class _Body:
+    """The mass distribution of what moves with one joint.
+
+    Attributes:
+        link: Name of the joint's child link.
+        mass: Mass in the URDF, kg.
+        centre: Its centre in the frame of the child link, m, shape (3,).
+        gyration: G of (BODY): Cholesky factor of the second moment of a unit mass, m, (3, 3).
+    """
+
+    def __init__(self, link: str, mass: float, centre: np.ndarray, second: np.ndarray):
+        self.link, self.mass, self.centre = link, mass, centre
+        self.gyration = np.linalg.cholesky(second) if mass else np.zeros((3, 3))
+
+    def parameters(self) -> Iterable[Parameter]:
+        """Its numbers, all at what the URDF says; none of a body without mass."""
+        if not self.mass:
+            return
+        for name, meaning, neutral, (lower, upper) in NUMBERS:
+            yield Parameter(
+                f'{self.link}_{name}', '1', f'{self.link}: {meaning}', lower, upper, neutral,
+                scale=BELIEF, logarithmic=neutral == 1.0, belief=True,
+            )  # fmt: skip
+
+    def symbols(self, p) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Mass in kg, first moment in kg m, (3, 1), and inertia about the origin, (3, 3)."""
+        if not self.mass:
+            return ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3)
+        x = {name: p[f'{self.link}_{name}'] for name, *_ in NUMBERS}
+        mass = self.mass * x['mass']
+        factor = ca.DM(self.gyration)
+        centre = ca.DM(self.centre) + ca.mtimes(
+            factor, ca.vertcat(x['shift_x'], x['shift_y'], x['shift_z'])
+        )
+        stretch = ca.vertcat(
+            ca.horzcat(x['stretch_x'], x['shear_xy'], x['shear_xz']),
+            ca.horzcat(0, x['stretch_y'], x['shear_yz']),
+            ca.horzcat(0, 0, x['stretch_z']),
+        )
+        image = ca.mtimes(factor, stretch)
+        second = mass * (ca.mtimes(image, image.T) + ca.mtimes(centre, centre.T))
+        return mass, mass * centre, ca.trace(second) * ca.DM.eye(3) - second
+
+    def inertial(self, values) -> Inertial:
+        """The same as numbers, about the centre of mass."""
+        m, h, about_origin = (np.asarray(ca.DM(x)) for x in self.symbols(values))
+        mass, h = float(m[0, 0]), h.ravel()
+        x, y, z = [float(part) for part in h / mass]
+        arm = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        i = (about_origin + mass * arm @ arm).tolist()
+        return Inertial(
+            mass, (x, y, z), (i[0][0], i[1][1], i[2][2], i[0][1], i[0][2], i[1][2])
+        )  # fmt: skip
+
+
+def _placed(joint: Joint, position: ca.SX | None) -> tuple[ca.SX, ca.SX]:
+    """Orientation and origin of a joint's child link in its parent's frame."""
+    turn, origin = ca.SX(ca.DM(rotation(joint.rpy))), ca.SX(ca.DM(joint.xyz))
+    if position is None:
+        return turn, origin
+    axis = ca.DM(joint.axis)
+    if joint.slides:
+        return turn, origin + ca.mtimes(turn, axis * position)
+    cross = ca.skew(axis)
+    about = (
+        ca.DM.eye(3) * ca.cos(position)
+        + (1 - ca.cos(position)) * ca.mtimes(axis, axis.T)
+        + ca.sin(position) * cross
+    )
+    return ca.mtimes(turn, about), origin
+
+
+def _place(description: RobotDescription, joint: Joint) -> str:
+    """Link by which what a joint carries is named: the tip, where one hangs firmly on its end."""
+    link = joint.child
+    while True:
+        behind = [other for other in description.joints if other.parent == link]
+        if len(behind) != 1 or behind[0].kind != 'fixed':
+            return joint.child if behind else link
+        link = behind[0].child
+
+
+def _bodies(description: RobotDescription) -> tuple[_Body, ...]:
+    """What each joint that moves carries, with the links that are fixed to it."""
+    home: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # link -> body, its frame there
+    sums: dict[str, np.ndarray] = {}  # body -> sum over its mass of (x, 1)(x, 1)', in its frame
+    for joint in description.joints:
+        if joint.kind != 'fixed':
+            home[joint.child] = (joint.child, np.eye(3), np.zeros(3))
+            sums[joint.child] = np.zeros((4, 4))
+        elif joint.parent in home:
+            body, turn, origin = home[joint.parent]
+            here = np.array(rotation(joint.rpy))
+            home[joint.child] = (body, turn @ here, origin + turn @ np.array(joint.xyz))
+    for link, (body, turn, origin) in home.items():
+        found = description.inertials.get(link)
+        if found is None:
+            continue
+        xx, yy, zz, xy, xz, yz = found.inertia
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        second = _second_moment(inertia, found.mass, f'URDF {description.name!r}: link {link!r}')
+        c = origin + turn @ np.array(found.centre)
+        about = turn @ second @ turn.T + found.mass * np.outer(c, c)
+        sums[body][:3, :3] += about
+        sums[body][:3, 3] += found.mass * c
+        sums[body][3, :3] += found.mass * c
+        sums[body][3, 3] += found.mass
+    made = []
+    for joint in description.moving:
+        total = sums[joint.child]
+        mass = float(total[3, 3])
+        if not mass:
+            made.append(_Body(joint.child, 0.0, np.zeros(3), np.eye(3)))
+            continue
+        c = total[:3, 3] / mass
+        made.append(_Body(joint.child, mass, c, total[:3, :3] / mass - np.outer(c, c)))
+    return tuple(made)
+
+
+def _second_moment(inertia: np.ndarray, mass: float, where: str) -> np.ndarray:
+    """Of a link about its centre, kg m^2, shape (3, 3).
+
+    Points and thin rods, which have none along some axis, get THINNEST.
+
+    Raises:
+        ModelError: if no body has this inertia.
+    """
+    sizes, axes = np.linalg.eigh(np.trace(inertia) / 2 * np.eye(3) - inertia)
+    if sizes[0] < -ROUNDED * abs(sizes[-1]) or not np.isfinite(sizes).all():
+        least = np.linalg.eigvalsh(inertia)
+        raise ModelError(
+            f'{where}: no body has the inertia with principal moments {least[0]:.3g}, '
+            f'{least[1]:.3g}, {least[2]:.3g} kg m^2; all must be positive, and none above the sum '
+            'of the others'
+        )
+    return (axes * np.maximum(sizes, mass * THINNEST**2)) @ axes.T
