@@ -94,7 +94,7 @@ def test_right_angles_are_right():
         ('mimic joint="elbow"', 'mimic joint="weld"', "'grip' follows 'weld'"),
         ('link name="tip"', 'link name="lower"', "two links are called 'lower'"),
         ('<robot name="arm">', '<sdf name="arm">', 'no XML|is no <robot>'),
-        ('<link name="finger"/>', '<x:leg xmlns:x="http://ros.org/wiki/xacro"/>', 'run `xacro` on it'),
+        ('<link name="finger"/>', '<x:leg xmlns:x="http://ros.org/xacro"/>', 'run `xacro` on'),
         ('<parent link="upper"/>', '', "joint 'elbow': no <parent"),
     ],
 )  # fmt: skip

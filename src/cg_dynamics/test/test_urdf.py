@@ -8,6 +8,7 @@ from random_trees import random_tree
 from cg_description.model_file import ModelFile
 from cg_description.robot_description import parse, with_inertials
 from cg_dynamics.assemble import assemble, parameter_vector
+from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import mechanism
 from cg_dynamics.mechanisms.urdf import Urdf
@@ -294,3 +295,61 @@ def test_sensitivities_are_the_derivatives_of_what_is_simulated(native):
         np.testing.assert_allclose(
             jacobian[:, :, column], difference, atol=2e-7 * (1 + np.abs(difference).max())
         )
+
+
+# --- effects ---
+
+
+def equations(model, setup=Setup()):  # noqa: B008 - immutable
+    e = assemble(model, setup)
+    return ca.Function('f', [e.x, e.u, e.p], [e.rates]), parameter_vector(model, setup)
+
+
+def test_places_are_named_by_the_urdf():
+    model = robot(random_tree(8, 3)).with_effect('coulomb_friction', 'joint_0', torque=0.2)
+    assert model.effects[0].label == 'coulomb_friction@joint_0'
+    assert robot(PENDULUM).with_effect('coulomb_friction').effects[0].label == 'coulomb_friction'
+
+
+def test_a_payload_is_as_a_welded_link():
+    # A point mass of 0.4 kg, once as an effect and once as a link of the URDF.
+    place = (0.1, -0.05, 0.2)
+    text = random_tree(8, 3)
+    welded = text.replace('</robot>', f"""<link name="load"><inertial><mass value="0.4"/>
+      <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="tie" type="fixed"><parent link="link_2"/><child link="load"/>
+      <origin xyz="{place[0]} {place[1]} {place[2]}"/></joint></robot>""")  # fmt: skip
+    x, y, z = place
+    carrying, p = equations(robot(text).with_effect('payload', 'link_2', mass=0.4, x=x, y=y, z=z))
+    heavier, p0 = equations(robot(welded))
+    random = np.random.default_rng(3)
+    for _ in range(5):
+        motion, u = random.normal(size=6), random.normal(size=3)
+        # The point is 1 mm large there: relative to its distance squared 2e-5.
+        np.testing.assert_allclose(carrying(motion, u, p), heavier(motion, u, p0), rtol=1e-4)
+
+
+def test_a_tilted_base_is_as_tilted_gravity():
+    model = robot(random_tree(8, 3))
+    tilted, p = equations(model.with_effect('ground_slope', x=0.03, y=-0.05))
+    cx, sx, cy, sy = np.cos(0.03), np.sin(0.03), np.cos(-0.05), np.sin(-0.05)
+    # In the frame of a base that was turned about x and then about y, up is:
+    about_x, about_y = (
+        [[1, 0, 0], [0, cx, sx], [0, -sx, cx]],
+        [[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]],
+    )
+    up = np.array(about_y) @ about_x @ [0, 0, 1]
+    leaning, p0 = equations(model, Setup(gravity=tuple(-up)))
+    motion, u = np.random.default_rng(4).normal(size=6), np.zeros(3)
+    np.testing.assert_allclose(tilted(motion, u, p), leaning(motion, u, p0), rtol=1e-9)
+
+
+@pytest.mark.parametrize('name', sorted(LIBRARY))
+def test_every_effect_acts_wherever_it_says_it_can(name):
+    model = robot(random_tree(8, 2), driven=['joint_0'])
+    kind = LIBRARY[name]
+    for site in kind.sites(model.mechanism) if kind.applies([Setup()]) else ():
+        values = {p.name: p.starts[0] for p in kind.parameters_in(model.mechanism) if p.starts}
+        f, p = equations(model.with_effect(name, site, **values))
+        x = np.random.default_rng(1).normal(0, 0.1, f.size1_in(0))
+        assert np.isfinite(np.asarray(f(x, np.ones(f.size1_in(1)), p))).all()

@@ -161,9 +161,17 @@ class Effect:
                 f'not at {at!r}'
             )
         self.site = sites[0] if at is None else at
-        self.at = None if self.site == sites[0] else self.site
+        # Of a robot that somebody drew no place is the usual one.
+        usual = sites[0] if mechanism.dimensions == 2 or len(sites) == 1 else None
+        self.at = None if self.site == usual else self.site
+        self.parameters = self.parameters_in(mechanism)  # type: ignore[misc]
         if self.slides(mechanism):
             self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
+
+    @classmethod
+    def parameters_in(cls, mechanism: Mechanism) -> tuple[Parameter, ...]:
+        """Its parameters in the plane, or in space where that takes others."""
+        return cls.parameters
 
     @property
     def label(self) -> str:

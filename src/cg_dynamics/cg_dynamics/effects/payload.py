@@ -5,6 +5,19 @@ import casadi as ca
 from cg_dynamics.effects.effect import BodyEffect
 from cg_dynamics.parameter import Parameter
 
+PLACE = tuple(
+    Parameter(
+        axis,
+        'm',
+        f'{axis} of the payload in the frame of the link',
+        -3.0,
+        3.0,
+        starts=(0.0,),
+        scale=0.05,
+    )
+    for axis in 'xyz'
+)
+
 
 class Payload(BodyEffect):
     """T = m |dr/dt|^2 / 2, V = m g (up . r) for a point r of a body."""
@@ -21,9 +34,16 @@ class Payload(BodyEffect):
         ),
     )  # fmt: skip
 
+    @classmethod
+    def parameters_in(cls, mechanism):
+        """In space its place is a point in the frame of the link."""
+        return cls.parameters if mechanism.dimensions == 2 else (cls.parameters[0], *PLACE)
+
     def energies(self, body, p):
         """Energies of the point mass."""
-        position, velocity = body.point(self.site, p['distance'])
+        spatial = body.mechanism.dimensions == 3
+        place = ca.vertcat(p['x'], p['y'], p['z']) if spatial else p['distance']
+        position, velocity = body.point(self.site, place)
         return (
             p['mass'] * ca.sumsqr(velocity) / 2,
             p['mass'] * body.p['gravity'] * ca.dot(body.up, position),

@@ -10,8 +10,8 @@ gravity. What a joint has to give is f along or n about its axis, once the bodie
 been added up: tau = ID(q, v, dv/dt). M(q) comes from composite bodies (CRB). Both are checked
 against MuJoCo and Drake (test_urdf_oracles.py).
 
-The numbers of a body are how far its mass distribution is from that in the URDF: an affine image of
-it, x -> c + G (t + D G^-1 (x - c)), and heavier by a ratio:
+The numbers of a body are how far its mass distribution is from that in the URDF, of which it is an
+affine image, x -> c + G (t + D G^-1 (x - c)), and heavier by a ratio:
 
     m = mu m0,    c = c0 + G t,    S = G D D' G',    S0 = G G'                           (BODY)
 

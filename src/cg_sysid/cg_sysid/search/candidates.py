@@ -9,6 +9,7 @@ import numpy as np
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.errors import DynamicsError
+from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import Failure
@@ -121,12 +122,12 @@ def candidates_for(
     return found
 
 
-def starts_of(name: str) -> list[dict[str, float]]:
+def starts_of(name: str, mechanism: Mechanism) -> list[dict[str, float]]:
     """Values of an effect's parameters from which its identification sets out."""
     grids = [
         [(p.name, start) for start in p.starts] if p.choice or (p.free and not p.each)
         else [(p.name, p.default if p.neutral is None else p.neutral)]
-        for p in LIBRARY[name].parameters
+        for p in LIBRARY[name].parameters_in(mechanism)
     ]  # fmt: skip
     return [
         dict(point)
@@ -296,7 +297,12 @@ def cost_of(task: Task) -> int:
     kind = LIBRARY[name]
     events = any(p.each == 'record' for p in kind.parameters)
     swept = any(p.swept for p in kind.parameters)
-    return 100 * events + 10 * bool(kind.states) + 10 * swept + len(starts_of(name))
+    return (
+        100 * events
+        + 10 * bool(kind.states)
+        + 10 * swept
+        + len(starts_of(name, task.model.mechanism))
+    )
 
 
 def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
@@ -339,7 +345,10 @@ def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
 
 def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     model, warm_starts = next(_starting_models(task)), task.warm_starts
-    if not warm_starts and len(starts_of(task.effect[0]) if task.effect else ()) > 1:
+    if (
+        not warm_starts
+        and len(starts_of(task.effect[0], task.model.mechanism) if task.effect else ()) > 1
+    ):
         warm_starts = _first_seconds(task, train)
     if not warm_starts:
         return _whole(task, model, train, None, task.iterations)
@@ -545,7 +554,7 @@ def _starting_models(task: Task):
     label = _label(task)
     small = any(effect.label == label for effect in task.model.effects)
     base = task.model.without_effect(label) if small else task.model
-    for start in starts_of(name):
+    for start in starts_of(name, base.mechanism):
         yield base.with_effect(name, at, **start | turning(base, name, at))
 
 
