@@ -21,6 +21,7 @@ PROGRAMS = [
     'report = cg_sysid.cli.report:main',
     'rehearse = cg_sysid.cli.rehearse:main',
     'new_model = cg_sysid.cli.new_model:main',
+    'new_robot = cg_sysid.cli.new_robot:main',
     'frequency_response = cg_sysid.identification.frequency_response:main',
 ]
 NODES = [

@@ -30,6 +30,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     'new-model': Command('cli.new_model', 'write a commented model file to start from'),
+    'new-robot': Command('cli.new_robot', 'write a model file from a URDF and recordings'),
     'import': Command(
         'records.importing', 'make recordings of logs from elsewhere: CSV, MAT, JSON'
     ),

@@ -103,16 +103,17 @@ def _meaning(p: Parameter) -> str:
 
 def _quantity(example: Model, name: str) -> str:
     q = example.quantities[name]
-    return _flow(Quantity(q.value, q.unit, q.tolerance, q.fixed, example.name))
+    return flow(Quantity(q.value, q.unit, q.tolerance, q.fixed, example.name))
 
 
-def _flow(q: Quantity) -> str:
+def flow(q: Quantity) -> str:
+    """A number as one line of YAML."""
     text = yaml.safe_dump(q.to_yaml(), default_flow_style=True, sort_keys=False, width=10 * WIDTH)
     return text.strip()
 
 
 def _effect(example: Model, effect: Effect) -> list[str]:
-    lines = [f'- name: {effect.name}   # {_shortened(effect.summary, effect.name)}']
+    lines = [f'- name: {effect.name}   # {shortened(effect.summary, effect.name)}']
     if effect.at:
         lines.append(f'  at: {effect.at}')
     lines.append('  parameters:')
@@ -127,11 +128,12 @@ def _others(body: Mechanism, example: Model) -> list[str]:
     names = [n for n, effect in LIBRARY.items() if n not in present and effect.sites(body)]
     return [
         OTHERS.rstrip(),
-        *(f'# - name: {name}   # {_shortened(LIBRARY[name].summary, name)}' for name in names),
+        *(f'# - name: {name}   # {shortened(LIBRARY[name].summary, name)}' for name in names),
     ]
 
 
-def _shortened(summary: str, name: str) -> str:
+def shortened(summary: str, name: str) -> str:
+    """What an effect does, as far as it fits behind its name."""
     return textwrap.shorten(summary, WIDTH - len(f'# - name: {name}   # '), placeholder=' ...')
 
 
@@ -144,7 +146,7 @@ def _entries(
         if key in given:
             q = given[key]
             stated = Quantity(q.value, q.unit, q.tolerance, q.fixed, example.name)
-            lines.append(f'    {key}: {_flow(stated)}')
+            lines.append(f'    {key}: {flow(stated)}')
         else:
             lines.append(f'    # {key}: {{value: ..., unit: {unit}, source: ...}}')
     return lines
