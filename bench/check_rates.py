@@ -255,7 +255,7 @@ def sound_table(seeds) -> Iterator[str]:
             check_recording(
                 raw,
                 model_path(NOMINAL_MODEL)
-                if raw.mechanism == 'compass_gait' and not raw.name.startswith('synthetic')
+                if raw.mechanism.name == 'compass_gait' and not raw.name.startswith('synthetic')
                 else None,
             )
             for raw in (*raws, *map(fault_injection.without_arrivals, raws))

@@ -18,6 +18,7 @@ from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimator
 from cg_hardware.safety import GateSettings, TorqueGate
+from cg_interfaces import channels
 from cg_sysid.records.raw import NOTE_FORMAT
 from cg_sysid.records.record import NS_PER_S, Record
 
@@ -134,8 +135,9 @@ def record_of(name: str, run: BalanceRun, setup: Setup) -> Record:
         'initial_state': 'moving',
         'closed_loop': True,
     }
+    robot = channels.mechanism(CompassGait.name)
     torques = {CompassGait.inputs[0]: run.torque}
-    return Record(name, stamps, torques, run.readings, CompassGait.name, setup, note)
+    return Record(name, stamps, torques, run.readings, robot, setup, note)
 
 
 def power_above(torque: np.ndarray, sample_time: float, frequency: float) -> float:

@@ -204,6 +204,15 @@ def mechanism(name: str) -> Mechanism:
     return _of_joints(BODIES[name])
 
 
+def interface(body: 'Body') -> Mechanism:
+    """The mechanism of a model's body: its row of the table, or what its joints tell.
+
+    Raises:
+        ValueError: It has no row, and a sensor that is none of a joint.
+    """
+    return MECHANISMS.get(body.name) or _of_joints(body)
+
+
 def _of_joints(body: 'Body') -> Mechanism:
     """The topics of a machine of joints, each output that of an encoder.
 

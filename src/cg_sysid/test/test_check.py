@@ -266,7 +266,7 @@ FAULTS = {
         None,
     ),
     'no set-up': (
-        lambda r: replace(r, note={'mechanism': r.mechanism}),
+        lambda r: replace(r, note={'mechanism': r.mechanism.name}),
         'metadata_missing',
         '',
         'warnings',

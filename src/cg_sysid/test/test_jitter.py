@@ -75,7 +75,7 @@ def test_noise_that_does_not_know_of_the_rate_is_no_jitter():
 
 def data_set(raw, name):
     """A recording as two windows of a data set."""
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     topic = raw.topics[known.outputs[0].name]
     time = (topic.stamp_ns - topic.stamp_ns[0]) / 1e9
     outputs = np.column_stack([topic.values[n] for n in known.output_names])

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
 from cg_interfaces.topics import APPLIED_TORQUE, TORQUE_COMMAND
 from cg_sysid.checks.signals import Signal
 from cg_sysid.records.findings import Finding
@@ -64,7 +63,7 @@ def check_content(
 
 def _topics(raw: RawRecording) -> Iterator[Finding]:
     """Topics that should be there."""
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     tied = raw.setup.fixture == 'legs_tied'
     if APPLIED_TORQUE not in raw.topics and not tied:
         if TORQUE_COMMAND in raw.topics:
@@ -158,7 +157,7 @@ def _model(raw: RawRecording, model: Path) -> Iterator[Finding]:
 
 def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     """A start that is not at rest as stated, or that can fall either way."""
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     begins = {}
     for name in known.output_names:
         signal = signals.get(name)
@@ -189,7 +188,7 @@ def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
             rate,
             REST_RATE,
         )
-    free = raw.mechanism == 'compass_gait' and raw.setup.fixture == 'none'
+    free = raw.mechanism.name == 'compass_gait' and raw.setup.fixture == 'none'
     if free and not raw.setup.springs and 'imu_angle' in begins and not moving:
         lean = begins['imu_angle'][0] - (
             begins.get('hip_angle', (0.0,))[0] if raw.setup.stance == 'outer' else 0.0
@@ -225,7 +224,7 @@ def _coverage(
     """The region of state space that the data lie in, and how it meets the region of use."""
     covered = {}
     for name, values in [(n, s.values) for n, s in signals.items()] + list(rates.items()):
-        if name in mechanism(raw.mechanism).extra_input_names:
+        if name in raw.mechanism.extra_input_names:
             continue
         low, high = (float(q) for q in np.quantile(values, [0.01, 0.99]))
         covered[name] = (low, high)
@@ -253,7 +252,7 @@ def _coverage(
                 value=share,
                 allowed=WELL_COVERED,
             )
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     angles = [signals[n] for n in known.output_names if n in signals and n.endswith('angle')]
     moved = [np.ptp(s.values) > LITTLE_MOTION * max(s.noise.sigma_floor, 1e-6) for s in angles]
     if angles and not any(moved):
@@ -267,7 +266,7 @@ def _coverage(
 
 def _excitation(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     """Amplitude and band of each torque."""
-    for name in mechanism(raw.mechanism).input_names:
+    for name in raw.mechanism.input_names:
         if name not in signals:
             continue
         signal = signals[name]
@@ -313,7 +312,7 @@ def _closed_loop(
             'delays and noise of the loop bias an identification',
         )
         return
-    for name in mechanism(raw.mechanism).input_names:
+    for name in raw.mechanism.input_names:
         if name not in signals or np.ptp(signals[name].values) == 0.0:
             continue
         torque = signals[name]

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
 from cg_sysid.checks.law import Law, Motion, fit_law, joint_of, motion_of
 from cg_sysid.checks.signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.records.findings import Finding
@@ -50,7 +49,7 @@ def check_dynamics(
         signals: Its channels.
         sound: Whether no grave fault is known; otherwise a law that does not hold says nothing.
     """
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     wanted = {n: signals[n] for n in (*known.input_names, *known.output_names) if n in signals}
     motion = motion_of(wanted)
     if motion is None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cg_interfaces import channels
 from cg_sysid.records.findings import CheckReport, Finding
 from cg_sysid.records.raw import RawRecording
 from cg_sysid.records.record import NS_PER_S
@@ -65,7 +64,7 @@ def _around(raw: RawRecording, name: str, finding: Finding) -> FaultSignal | Non
     if near.sum() < 2:
         return None
     order = np.argsort(time[near], kind='stable')
-    units = {c.name: c.unit for t in channels.mechanism(raw.mechanism).topics.values()
+    units = {c.name: c.unit for t in raw.mechanism.topics.values()
              for c in t.channels}  # fmt: skip
     return FaultSignal(
         name, channel, units.get(channel, '1'), finding.code, start, stop,

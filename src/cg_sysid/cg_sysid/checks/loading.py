@@ -9,9 +9,11 @@ from typing import Any
 
 from cg_dynamics.model import Model
 from cg_interfaces import topics
+from cg_interfaces.channels import Mechanism, interface
 from cg_sysid.checks.faults import FaultSignal, fault_signals
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.errors import RecordingError
+from cg_sysid.identification.data_set import require_same_robot
 from cg_sysid.identification.windows import (
     NOT_CUT,
     SHORTEST_WINDOW,
@@ -115,7 +117,7 @@ def load_bags(
         bags: Paths of bags.
         model_file: Model file that they will be used with; with it walking records are cut at
             their touchdowns, and others where they cannot be followed whole (following.py).
-        note: Recording note for bags that carry none.
+        note: Recording note for bags that carry none; what names no robot is of the model's.
         torque: `applied` or `command`; by default the applied torque where there is one.
         window: Cut records into windows of this length in s instead.
         progress: Called with (what, done, total).
@@ -123,25 +125,29 @@ def load_bags(
 
     Raises:
         ValueError: `use_anyway` names what cannot be overruled.
+        ValueError: A record is of another robot than the model.
         RecordingError: A path is no bag at all, is given twice, or a window is too short.
     """
     if window is not None and not window >= SHORTEST_WINDOW:
         raise RecordingError(f'window is {window:g} s; at least {SHORTEST_WINDOW:g} s are needed')
     anyway = overrulable(use_anyway)
     paths = _distinct(bags)
+    model = Model.load(model_file) if model_file else None
+    mechanism = interface(model.mechanism) if model else None
     sources: list[Source] = []
     records: list[Record] = []
     origin: dict[str, str] = {}
     for done, (name, path) in enumerate(paths.items()):
         progress('reading and checking bags', done, len(paths))
-        source, record = _take(name, path, model_file, note, torque, anyway)
+        source, record = _take(name, path, model_file, note, torque, anyway, mechanism)
         sources.append(source)
         if record is None:
             continue
         records.append(record)
         origin[record.name] = name
     progress('reading and checking bags', len(paths), len(paths))
-    model = Model.load(model_file) if model_file else None
+    if model is not None:
+        require_same_robot(model, records)
     cut = cut_steps(records, model)
     windows = _followed(model, cut.records, window)
     pieces: list[Record] = []
@@ -159,7 +165,7 @@ def load_bags(
 
 
 def _followed(model: Model | None, records: Sequence[Record], window: float | None) -> Windows:
-    if model is None or any(r.mechanism != model.mechanism.name for r in records):
+    if model is None:
         return Windows(tuple(Followed(r.name, 1.0) for r in records), window)
     return Windows(followed(model, records), window)
 
@@ -196,10 +202,11 @@ def _take(
     note: Mapping[str, Any] | None,
     torque: str | None,
     anyway: frozenset[str],
+    mechanism: Mechanism | None,
 ) -> tuple[Source, Record | None]:
     digest = bag_hash(path)
     try:
-        raw = read_raw(path, note)
+        raw = read_raw(path, note, mechanism)
         report = check_recording(raw, model_file, use_anyway=anyway)
         record = None
         if report.verdict != 'unusable':

@@ -19,6 +19,7 @@ from rich.console import Console
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
+from cg_interfaces.channels import Mechanism, interface
 from cg_sysid.checks.content import check_content
 from cg_sysid.checks.dynamics import check_dynamics
 from cg_sysid.checks.kinematics import check_kinematics
@@ -28,6 +29,7 @@ from cg_sysid.checks.signals import check_signals, read_signals
 from cg_sysid.checks.signs import check_signs
 from cg_sysid.checks.timing import check_timing
 from cg_sysid.errors import RecordingError
+from cg_sysid.identification.data_set import other_robot
 from cg_sysid.progress import Bars
 from cg_sysid.records.bags import RawRecording, load_note, read_raw, to_record
 from cg_sysid.records.clock import mend_clocks
@@ -48,7 +50,8 @@ def check_recording(
 
     Args:
         recording: Path of a bag, or a recording as `read_raw` returns it.
-        model: Model file that the recording is about to be used with.
+        model: Model file that the recording is about to be used with; a bag that names no robot
+            is of that model's.
         use_region: Quantity -> (lowest, highest) value at which the model will be used, for
             channels and rates of angles, such as `{'hip_angle_rate': (-2.0, 2.0)}`.
         note: Recording note for a bag that carries none.
@@ -62,8 +65,13 @@ def check_recording(
         ValueError: `use_anyway` names what cannot be overruled.
     """
     anyway = overrulable(use_anyway)
+    robot, mechanism, unreadable = _model(model)
     try:
-        raw = recording if isinstance(recording, RawRecording) else read_raw(recording, note)
+        raw = (
+            recording
+            if isinstance(recording, RawRecording)
+            else read_raw(recording, note, mechanism)
+        )
         setup_error = _setup_error(raw)
     except RecordingError as error:
         name = Path(str(recording)).name
@@ -77,7 +85,8 @@ def check_recording(
     # What depends on several samples makes no sense where single ones, or their stamps, are wrong.
     faulty = {finding.where for finding in findings if finding.severity == 'error'}
     sane = {n: s for n, s in signals.items() if not faulty & {n, s.topic}}
-    robot, unreadable = _model(model)
+    if robot is not None and other_robot(raw.mechanism, robot):
+        robot = None
     jumps = [*check_steps(raw, sane, robot), *check_kinematics(sane)]
     findings += overrule(_not_of_landings(raw, robot, jumps), anyway)
     sound = not any(finding.severity == 'error' for finding in findings)
@@ -97,14 +106,17 @@ def _setup_error(raw: RawRecording) -> Finding | None:
     return None
 
 
-def _model(path: str | Path | None) -> tuple[Model | None, list[Finding]]:
-    """The model in a file; without one, signs are compared as far as that goes."""
+def _model(
+    path: str | Path | None,
+) -> tuple[Model | None, Mechanism | None, list[Finding]]:
+    """The model in a file, and its channels; signs are compared without one, too."""
     if path is None:
-        return None, []
+        return None, None, []
     try:
-        return Model.load(path), []
+        model = Model.load(path)
+        return model, interface(model.mechanism), []
     except ValueError as error:
-        return None, [Finding('model_unreadable', 'info', '', str(error))]
+        return None, None, [Finding('model_unreadable', 'info', '', str(error))]
 
 
 def _not_of_landings(

@@ -11,7 +11,6 @@ import numpy as np
 
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
-from cg_interfaces.channels import mechanism
 from cg_sysid.checks.resting import resting_band
 from cg_sysid.checks.sampling import timing_errors
 from cg_sysid.checks.signals import RESTING_S, Signal, rests, without_spikes
@@ -40,13 +39,13 @@ def check_steps(
     """
     timing = timing_errors(signals)
     bands: dict[str, float] | None = None
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     clean = {
         name: without_spikes(signals[name])
         for name in (*known.input_names, *known.output_names)
         if name in signals and np.ptp(signals[name].values) > 0.0
     }
-    knocks = raw.mechanism == CompassGait.name and raw.setup.may_step
+    knocks = raw.mechanism.name == CompassGait.name and raw.setup.may_step
     for name, signal in clean.items():
         if not name.endswith('angle'):
             continue  # a torque may jump, and a rate at a knock
@@ -86,7 +85,7 @@ def check_steps(
             )
         else:
             bands = _resting_bands(raw, model) if bands is None else bands
-            yield _shift(step, signal, place, bands.get(name, 0.0), _play(raw, model))
+            yield _shift(step, signal, place, bands.get(name, 0.0), _play(model))
 
 
 def _shift(
@@ -110,16 +109,16 @@ def _shift(
     return Finding('zero_shift', 'warning', signal.channel, text, *place, step.size, fine)
 
 
-def _play(raw: RawRecording, model: Model | None) -> float:
+def _play(model: Model | None) -> float:
     """The widest play of the model's gears; what is light crosses it between two samples."""
-    if model is None or model.mechanism.name != raw.mechanism:
+    if model is None:
         return 0.0
     return max((model.values_of(effect).get('gap', 0.0) for effect in model.effects), default=0.0)
 
 
 def _resting_bands(raw: RawRecording, model: Model | None) -> dict[str, float]:
     """Friction over stiffness of each joint, by the model; empty without one."""
-    if model is None or model.mechanism.name != raw.mechanism:
+    if model is None:
         return {}
     try:
         return resting_band(model, raw.setup)
@@ -182,5 +181,5 @@ def _jumps_too(signal: Signal, instant: float, time: float) -> bool | None:
 
 
 def _measured(raw: RawRecording) -> list[str]:
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     return [t.name for t in (known.torque, *known.outputs) if len(raw.topics.get(t.name, ()))]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.noise import ChannelNoise, channel_noise, resolution
 from cg_sysid.records.raw import RawRecording
@@ -75,7 +74,7 @@ def read_signals(raw: RawRecording) -> dict[str, Signal]:
     """Every channel of a recording that has enough samples to be checked."""
     stamps = [t.stamp_ns for t in raw.topics.values() if len(t)]
     origin = min((int(s.min()) for s in stamps), default=0)
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     signals = {}
     for topic in raw.topics.values():
         if topic.name == known.command.name:
@@ -111,7 +110,7 @@ def rests(signal: Signal, start: float, stop: float) -> bool:
 
 def check_signals(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     """Findings about each signal for itself."""
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     yield from _not_finite(raw)
     for name in known.output_names:
         if name in signals:

@@ -17,7 +17,6 @@ import numpy as np
 
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.model import Model
-from cg_interfaces.channels import mechanism
 from cg_sysid.checks.dynamics import drives
 from cg_sysid.checks.kinematics import agreement_of_imu
 from cg_sysid.checks.law import Motion, fit_law, joint_of, motion_of
@@ -66,7 +65,7 @@ def check_signs(
         model: Nominal model of the machine.
     """
     relations = list(_relations(raw, signals))
-    if model is not None and model.mechanism.name == raw.mechanism:
+    if model is not None:
         relations += _by_model(raw, signals, model)
     known = sorted({channel for relation in relations for channel in relation.channels})
     sets = [
@@ -102,7 +101,7 @@ def _relations(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Rel
             agreement > 0,
             f'imu_rate is the derivative of imu_angle, and their correlation is {agreement:.2f}',
         )
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     motion = _motion(raw, signals)
     if motion is None:
         return
@@ -138,7 +137,7 @@ def _pair(first: str, second: str, same: bool, text: str) -> Relation:
 
 
 def _motion(raw: RawRecording, signals: Mapping[str, Signal]) -> Motion | None:
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     return motion_of(
         {n: signals[n] for n in (*known.input_names, *known.output_names) if n in signals}
     )

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
 from cg_interfaces.topics import APPLIED_TORQUE, EXPERIMENT, TORQUE_COMMAND
 from cg_sysid.records.clock import FLOOR, independent_arrivals, lost_behind_stamps
 from cg_sysid.records.findings import Finding
@@ -61,7 +60,7 @@ def _seconds(stamp_ns: int | np.integer, origin: int) -> float:
 
 def _overlap(raw: RawRecording, origin: int) -> Iterator[Finding]:
     """Topics that do not span the recording."""
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     names = [t.name for t in (known.torque, *known.outputs) if len(raw.topics.get(t.name, ()))]
     spans = {n: (raw.topics[n].stamp_ns.min(), raw.topics[n].stamp_ns.max()) for n in names}
     if len(spans) < 2:
@@ -180,7 +179,7 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
             before,
         )
         return
-    known = mechanism(raw.mechanism)
+    known = raw.mechanism
     ends = [
         raw.topics[t.name].stamp_ns[-1]
         for t in (known.torque, *known.outputs)
@@ -261,7 +260,7 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
     lost = int(np.sum(np.rint(spacing[gaps] / usual[gaps]) - 1))
     share = lost / (len(stamp) + lost)
     worst, unknown, repair = int(gaps[np.argmax(spacing[gaps])]), False, 'they are left out'
-    if topic.name == mechanism(raw.mechanism).torque.name:
+    if topic.name == raw.mechanism.torque.name:
         unknown, worst, repair = _torque_over(topic, order, gaps, worst)
     elif share > LOST_SHARE and spacing[worst] > LONG_GAP_S * NS_PER_S:
         # A sensor that reports only now and then is read as it comes; one that stops is not.

@@ -35,7 +35,6 @@ from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.experiments.catalogue import experiments_for
 from cg_sysid.progress import Bars
 from cg_sysid.provenance import provenance
-from cg_sysid.records.record import Record
 from cg_sysid.report import curves, write_report
 from cg_sysid.report.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
 
@@ -132,7 +131,6 @@ def work(options: argparse.Namespace) -> int:
             bars,
             options.use_anyway,
         )
-        _same_mechanism(model, loaded.records)
         origin = provenance(
             model_file,
             ['cg', 'diagnose', *_command(options)],
@@ -189,15 +187,6 @@ def _command(options: argparse.Namespace) -> list[str]:
     if options.budget != BUDGET:
         words += ['--budget', f'{options.budget:g}']
     return [*words, *options.bags]
-
-
-def _same_mechanism(model: Model, records: Sequence[Record]) -> None:
-    for record in records:
-        if record.mechanism != model.mechanism.name:
-            raise ValueError(
-                f'{record.source}: recorded on a {record.mechanism}, but the model '
-                f'{model.name!r} is of a {model.mechanism.name}'
-            )
 
 
 def _too_few(loaded: Loaded) -> bool:

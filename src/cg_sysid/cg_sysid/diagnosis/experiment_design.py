@@ -15,6 +15,7 @@ import numpy as np
 
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
+from cg_interfaces.channels import interface
 from cg_sysid.experiments.catalogue import Experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.identification.data_set import DataSet, as_data_set
@@ -130,7 +131,7 @@ def imagined(
         stamp_ns=np.rint(1e9 * time).astype(np.int64),
         inputs={name: torque for name in body.inputs},
         outputs={channel: np.zeros(len(time)) for channel in body.outputs},
-        mechanism=body.name,
+        mechanism=interface(body),
         setup=experiment.setup,
         note={},
     )

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
 from cg_sysid.records.raw import RawRecording, RawTopic
 from cg_sysid.records.record import NS_PER_S, Record
 
@@ -28,7 +27,7 @@ def as_recorded(record: Record, seed: int = 0) -> RawRecording:
         seed: Of the delays of arrival.
     """
     rng = np.random.default_rng(seed)
-    known = mechanism(record.mechanism)
+    known = record.mechanism
     signals = {**record.inputs, **record.outputs}
     stamp = START_NS + record.stamp_ns
     topics = {}

@@ -11,6 +11,7 @@ import numpy as np
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
+from cg_interfaces.channels import interface
 from cg_sysid.records.record import Record
 
 Signal = Callable[[float], float]
@@ -64,7 +65,7 @@ def rehearse(
         stamp_ns=stamps,
         inputs=dict(zip(machine.mechanism.inputs, inputs.T, strict=True)),
         outputs={channel: np.array(values) for channel, values in outputs.items()},
-        mechanism=machine.mechanism.name,
+        mechanism=interface(machine.mechanism),
         setup=setup,
         note=note,
     )

@@ -70,7 +70,7 @@ def synthesise(synthesis: Synthesis, seed: int) -> RawRecording:
         t.name: _topic(t, stamp, np.maximum.accumulate(log), values)
         for t in (known.torque, *known.outputs)
     }
-    return RawRecording(f'synthetic_{seed}', _note(synthesis), known.name, topics)
+    return RawRecording(f'synthetic_{seed}', _note(synthesis), known, topics)
 
 
 def _topic(

@@ -16,6 +16,7 @@ from cg_dynamics.effects.effect import SESSION_TIME, TIME
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_interfaces import channels
 from cg_sysid.records.noise import measure_noise
 from cg_sysid.records.record import NS_PER_S, Record
 
@@ -92,21 +93,44 @@ def prepare(model: Model, records: Sequence[Record]) -> list[DataSet]:
     Their recordings are one session.
 
     Raises:
-        ValueError: if a record is of another mechanism.
+        ValueError: if a record is of another robot.
     """
-    body = model.mechanism
-    for record in records:
-        if record.mechanism != body.name:
-            raise ValueError(
-                f'record {record.name!r} is of a {record.mechanism}, the model {model.name!r} '
-                f'of a {body.name}'
-            )
+    require_same_robot(model, records)
     sigma = noise_floor(model, records)
     starts = session_starts(records)
     return [
-        replace(as_data_set(body, record, sigma), session=starts[recording_of(record)])
+        replace(as_data_set(model.mechanism, record, sigma), session=starts[recording_of(record)])
         for record in records
     ]
+
+
+def require_same_robot(model: Model, records: Sequence[Record]) -> None:
+    """Let records pass that are of the robot of a model.
+
+    Raises:
+        ValueError: One is of another robot.
+    """
+    for record in records:
+        if reason := other_robot(record.mechanism, model):
+            raise ValueError(f'{recording_of(record)}: {reason}')
+
+
+def other_robot(recorded: channels.Mechanism, model: Model) -> str:
+    """Why a recording is not of the robot of a model; empty if it is.
+
+    Robots in the table of channels.py go by their names; others must have the same channels too.
+    """
+    body = model.mechanism
+    if recorded.name != body.name:
+        return f'recorded on a {recorded.name}, but the model {model.name!r} is of a {body.name}'
+    theirs, ours = (
+        {channel for topic in each.topics.values() for channel in topic.channels}
+        for each in (recorded, channels.interface(body))
+    )
+    if theirs == ours:
+        return ''
+    apart = ', '.join(sorted(f'{c.name} ({c.place}, {c.unit})' for c in theirs ^ ours))
+    return f'its channels and those of the model {model.name!r} differ: only one has {apart}'
 
 
 def recording_of(record: Record) -> str:

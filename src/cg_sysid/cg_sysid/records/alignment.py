@@ -34,8 +34,7 @@ def to_record(
         RecordingError: A topic is missing, holds too few samples, values that are not finite,
             or a time that runs backwards.
     """
-    mechanism = channels.mechanism(raw.mechanism)
-    setup = raw.setup
+    mechanism, setup = raw.mechanism, raw.setup
     raw, _ = mend_clocks(raw)
     inputs = _cleaned_inputs(raw, mechanism, setup, torque_topic)
     outputs = {}
@@ -60,7 +59,7 @@ def to_record(
         stamp_ns=rows[known],
         inputs={c: v[known] for c, v in held.items()},
         outputs={c: v[known] for c, v in placed.items() if not np.isnan(v[known]).all()},
-        mechanism=raw.mechanism,
+        mechanism=mechanism,
         setup=setup,
         note=raw.note,
         source=raw.note.get('recording') or raw.path,
@@ -105,7 +104,6 @@ def _clean(raw: RawRecording, topic_name: str) -> dict[str, tuple[np.ndarray, np
     """Channel -> (stamps, values) of one topic, in order of stamps, repeats dropped."""
     samples = raw.topics[topic_name]
     where = f'{raw.path}: topic {topic_name}'
-    mechanism = channels.mechanism(raw.mechanism)
     cleaned = {}
     for name, values in samples.values.items():
         keep = ~samples.absent[name]
@@ -114,7 +112,7 @@ def _clean(raw: RawRecording, topic_name: str) -> dict[str, tuple[np.ndarray, np
             k = int(bad[0])
             since = (samples.stamp_ns[k] - samples.stamp_ns[0]) / NS_PER_S
             msg = (
-                f'{where}: {mechanism.channel(name).place} is {values[k]} at sample {k} '
+                f'{where}: {raw.mechanism.channel(name).place} is {values[k]} at sample {k} '
                 f'(t = {since:.3f} s); {len(bad)} such value(s), only finite ones are allowed'
             )
             raise RecordingError(msg)

@@ -63,7 +63,7 @@ def write_bag(path: str | Path, record: Record, commands: Mapping[str, Any] | No
 
 def _write(path: Path, record: Record, commands: dict[str, Any]) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
-    mechanism = channels.mechanism(record.mechanism)
+    mechanism = record.mechanism
     signals = {**record.inputs, **record.outputs}
     series = [
         (topic, signals) for topic in mechanism.topics.values() if topic.name != TORQUE_COMMAND
@@ -99,7 +99,7 @@ def note_text(record: Record) -> str:
     note = {
         'format': NOTE_FORMAT,
         **record.note,
-        'mechanism': record.mechanism,
+        'mechanism': record.mechanism.name,
         'setup': record.setup.to_dict(),
     }
     return yaml.safe_dump(note, sort_keys=False, allow_unicode=True)

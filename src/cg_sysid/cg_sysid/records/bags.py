@@ -46,6 +46,7 @@ def read_bag(
     note: Mapping[str, Any] | None = None,
     torque_topic: str | None = None,
     shared_row_ns: int = SHARED_ROW_NS,
+    mechanism: channels.Mechanism | None = None,
 ) -> Record:
     """Read a bag to a record.
 
@@ -55,19 +56,26 @@ def read_bag(
         torque_topic: `/applied_torque` or `/torque_command`; the default is the applied torque
             where the bag has it, the command otherwise.
         shared_row_ns: Samples of different topics this close in ns share a row.
+        mechanism: See `read_raw`.
 
     Raises:
         RecordingError: The bag cannot be used.
     """
-    return to_record(read_raw(path, note), torque_topic, shared_row_ns)
+    return to_record(read_raw(path, note, mechanism), torque_topic, shared_row_ns)
 
 
-def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawRecording:
+def read_raw(
+    path: str | Path,
+    note: Mapping[str, Any] | None = None,
+    mechanism: channels.Mechanism | None = None,
+) -> RawRecording:
     """Read every sample of a bag as it stands, in the order in which it was recorded.
 
     Args:
         path: Bag directory (or a single .mcap or .db3 file).
         note: Recording note for a bag that carries none; its entries go before those in the bag.
+        mechanism: What was recorded where the note does not say; and where it names this one,
+            which need not be in the table (`channels.interface` makes it of a model's body).
 
     Raises:
         RecordingError: This is no bag, it is cut off, it has no usable note, or a topic that
@@ -83,7 +91,7 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
     require_sound(path)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            return _read_open(path, reader, note)
+            return _read_open(path, reader, note, mechanism)
     except RecordingError:
         raise
     except Exception as error:  # every library below has its own kinds: translated here
@@ -91,12 +99,17 @@ def read_raw(path: str | Path, note: Mapping[str, Any] | None = None) -> RawReco
         raise RecordingError(f'{path}: not a readable rosbag2 recording ({what})') from error
 
 
-def _read_open(path: Path, reader: AnyReader, note: Mapping[str, Any] | None) -> RawRecording:
+def _read_open(
+    path: Path,
+    reader: AnyReader,
+    note: Mapping[str, Any] | None,
+    of_model: channels.Mechanism | None,
+) -> RawRecording:
     """The body of `read_raw`, on an open reader."""
     if reader.message_count == 0:
         raise RecordingError(f'{path}: empty; the bag holds no message')
     merged_note = {**_read_note(path, reader), **(note or {})}
-    mechanism = _mechanism_of(path, merged_note)
+    mechanism = _mechanism_of(path, merged_note, of_model)
     topics = mechanism.topics
     used = [c for c in reader.connections if c.topic in topics]
     for connection in used:
@@ -126,7 +139,7 @@ def _read_open(path: Path, reader: AnyReader, note: Mapping[str, Any] | None) ->
     return RawRecording(
         path=str(path),
         note=merged_note,
-        mechanism=mechanism.name,
+        mechanism=mechanism,
         topics={name: _raw_topic(topics[name], rows) for name, rows in samples.items()},
         others=others,
     )
@@ -197,8 +210,13 @@ def _checked_note(text: str, where: str, schema: Form) -> dict[str, Any]:
     return schema.of(note, where, RecordingError)
 
 
-def _mechanism_of(path: Path, note: Mapping[str, Any]) -> channels.Mechanism:
-    if not note.get('mechanism'):
+def _mechanism_of(
+    path: Path, note: Mapping[str, Any], of_model: channels.Mechanism | None
+) -> channels.Mechanism:
+    name = note.get('mechanism')
+    if of_model is not None and name in (None, '', of_model.name):
+        return of_model
+    if not name:
         msg = (
             f'{path}: nothing says which mechanism was recorded; put a note with '
             f'`mechanism` and `setup` on {EXPERIMENT} or give one (--note note.yaml); '
@@ -206,6 +224,6 @@ def _mechanism_of(path: Path, note: Mapping[str, Any]) -> channels.Mechanism:
         )
         raise RecordingError(msg)
     try:
-        return channels.mechanism(note['mechanism'])
+        return channels.mechanism(name)
     except ValueError as error:
         raise RecordingError(f'{path}: note: {error}') from None

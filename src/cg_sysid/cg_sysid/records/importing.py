@@ -319,7 +319,7 @@ def _record_of(mapping: dict, path: Path, table: Table, rows: np.ndarray, number
         stamp_ns=stamps,
         inputs={c: v for c, v in signals.items() if c in is_input},
         outputs={c: v for c, v in signals.items() if c not in is_input},
-        mechanism=mechanism.name,
+        mechanism=mechanism,
         setup=setup,
         note={**note, 'mechanism': mechanism.name, 'setup': setup.to_dict()},
         source=note.get('recording') or str(path),

@@ -8,6 +8,7 @@ import numpy as np
 
 from cg_description.schema import NAME, Anything, Flag, Key, MapOf, Mapping, Number, Text
 from cg_dynamics.rig import Setup
+from cg_interfaces.channels import Mechanism, mechanism
 from cg_sysid.errors import RecordingError
 
 NOTE_FORMAT = 'cg_recording/1'
@@ -63,16 +64,20 @@ class RawRecording:
     Attributes:
         path: Where it was read from.
         note: The recording note, as read.
-        mechanism: Name of the mechanism.
+        mechanism: Topics of the robot; its name will do where it has a row in channels.py.
         topics: Topic name -> samples, of the topics that the mechanism knows.
         others: Names of the topics that the analysis does not use, with their message types.
     """
 
     path: str
     note: dict[str, Any]
-    mechanism: str
+    mechanism: Mechanism
     topics: dict[str, RawTopic]
     others: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.mechanism, str):
+            object.__setattr__(self, 'mechanism', mechanism(self.mechanism))
 
     @property
     def name(self) -> str:

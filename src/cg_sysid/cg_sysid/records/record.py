@@ -29,7 +29,7 @@ class Record:
             increasing, N >= 2.
         inputs: Channel -> value held from its stamp to the next row, shape (N,), finite.
         outputs: Channel -> measured value, shape (N,), NaN on rows without a sample of it.
-        mechanism: Name of the mechanism (channels.py).
+        mechanism: Channels of the robot (channels.py); its name will do where it has a row there.
         setup: What was done to the rig.
         note: The recording note as read.
         source: The recording that its note names, or the path that it was read from, or the record
@@ -41,14 +41,16 @@ class Record:
     stamp_ns: np.ndarray
     inputs: dict[str, np.ndarray]
     outputs: dict[str, np.ndarray]
-    mechanism: str
+    mechanism: channels.Mechanism
     setup: Setup = field(default_factory=Setup)
     note: dict[str, Any] = field(default_factory=dict)
     source: str = ''
     since: float = 0.0
 
     def __post_init__(self) -> None:
-        known = channels.mechanism(self.mechanism)
+        if isinstance(self.mechanism, str):
+            object.__setattr__(self, 'mechanism', channels.mechanism(self.mechanism))
+        known = self.mechanism
         stamp = np.array(self.stamp_ns)
         if stamp.ndim != 1 or stamp.dtype.kind not in 'iu':
             raise self._error(
@@ -73,8 +75,7 @@ class Record:
         missing = [name for name in known.input_names if name not in self.inputs]
         if missing:
             raise self._error(
-                f'input {missing[0]} is missing; {self.mechanism} needs '
-                f'{", ".join(known.input_names)}'
+                f'input {missing[0]} is missing; {known.name} needs {", ".join(known.input_names)}'
             )
         if not self.outputs:
             raise self._error(
@@ -89,7 +90,7 @@ class Record:
         for name, values in signals.items():
             if name not in allowed:
                 raise self._error(
-                    f'unknown {kind} {name!r}; {self.mechanism} has {", ".join(allowed)}'
+                    f'unknown {kind} {name!r}; {self.mechanism.name} has {", ".join(allowed)}'
                 )
             array = np.array(values, dtype=float)
             if array.shape != self.stamp_ns.shape:

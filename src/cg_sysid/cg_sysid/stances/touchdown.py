@@ -78,7 +78,7 @@ def find_touchdowns(record: Record, model: Model) -> list[Touchdown]:
         record: Its set-up names the leg that stands at the start.
         model: The nominal model; it may lack what moves a robot a little differently.
     """
-    known = isinstance(model.mechanism, CompassGait) and record.mechanism == CompassGait.name
+    known = isinstance(model.mechanism, CompassGait) and record.mechanism.name == CompassGait.name
     if not known or not record.setup.may_step:
         return []
     sides = _sides(record)
