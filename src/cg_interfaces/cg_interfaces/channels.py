@@ -6,7 +6,7 @@ work on any object that has the fields of the ROS message: those of `rosbags`, o
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, cos, isfinite, sin, sqrt
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 IMU = 'sensor_msgs/msg/Imu'
 STRING = 'std_msgs/msg/String'
+
+# Kind of a sensor of a joint -> field of the JointState that it fills.
+SENSOR_FIELDS = {'encoder': 'position', 'tachometer': 'velocity'}
 
 QUATERNION_NORM_TOLERANCE = 1e-2  # [1]; a drive that never filled the field sends norm 0
 
@@ -69,7 +72,8 @@ class Mechanism:
     """The topics of one mechanism, inputs apart from outputs.
 
     The torque command carries the same channels as the applied torque. It is the input only
-    where there is no applied torque, or on request.
+    where there is no applied torque, or on request. Where there is neither, the effort of the
+    joints on /joint_states is.
     """
 
     name: str
@@ -83,6 +87,15 @@ class Mechanism:
         """Every topic by its name."""
         every = (self.torque, self.command, *self.extra_inputs, *self.outputs)
         return {topic.name: topic for topic in every}
+
+    @property
+    def topics_with_effort(self) -> dict[str, Topic]:
+        """Every topic by its name, the torque channels also on /joint_states."""
+        found = self.topics
+        if states := found.get(topics.JOINT_STATES):
+            both = (*states.channels, *self.torque.channels)
+            found[topics.JOINT_STATES] = replace(states, channels=both)
+        return found
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -108,6 +121,13 @@ class Mechanism:
     def output_names(self) -> tuple[str, ...]:
         """Names of the measured channels, in model order."""
         return tuple(c.name for topic in self.outputs for c in topic.channels)
+
+    def position_of(self, torque: str) -> str:
+        """The channel that measures where the joint of a torque is; empty if none does."""
+        joint = self.channel(torque).joint
+        measured = (c for topic in self.outputs for c in topic.channels)
+        fits = (c.name for c in measured if (c.joint, c.field) == (joint, 'position'))
+        return next(fits, '')
 
     def channel(self, name: str) -> Channel:
         """The channel of that name.
@@ -189,7 +209,7 @@ def mechanism(name: str) -> Mechanism:
     """The mechanism of that name.
 
     One that has no row in the table has the topics of any machine of joints: torques, a switch of
-    its drive, and an encoder for each output on /joint_states.
+    its drive, and its encoders and tachometers on /joint_states.
 
     Raises:
         ValueError: No such mechanism; the message lists those there are.
@@ -214,32 +234,40 @@ def interface(body: 'Body') -> Mechanism:
 
 
 def _of_joints(body: 'Body') -> Mechanism:
-    """The topics of a machine of joints, each output that of an encoder.
+    """The topics of a machine of joints, each output that of an encoder or a tachometer.
 
-    The encoder of a joint that is driven has its name, any other that of its coordinate.
+    The sensor of a joint that is driven has its name, any other that of its coordinate.
     """
+    import casadi as ca
+
     frame = next(iter(body.joints)) if len(body.joints) == 1 else 'base'
-    driven = {tuple(row): joint for joint, row in body.joints.items()}
     torques = tuple(
         Channel(channel, unit, 'effort', joint)
         for channel, unit, joint in zip(body.inputs, body.input_units, body.joints, strict=True)
     )
     count = len(body.coordinates)
-    angles = []
-    for k, (channel, unit) in enumerate(zip(body.outputs, body.output_units, strict=True)):
-        if body.sensor_kinds[channel] != 'encoder' or k >= count:
+    rows = [tuple(float(i == k) for i in range(count)) for k in range(count)]
+    joint_of = dict(zip(rows, body.coordinates, strict=True))
+    joint_of |= {tuple(row): joint for joint, row in body.joints.items()}
+    q, v = ca.SX.sym('q', count), ca.SX.sym('v', count)
+    ideal = body.sensors(q, v)
+    measured = []
+    for channel, unit in zip(body.outputs, body.output_units, strict=True):
+        field = SENSOR_FIELDS.get(body.sensor_kinds[channel])
+        slope = ca.jacobian(ideal[channel], v if field == 'velocity' else q)
+        row = tuple(ca.evalf(slope).full()[0]) if slope.is_constant() else ()
+        if field is None or row not in joint_of:
             msg = (
-                f'{body.name}: output {channel!r} is no encoder of a coordinate; its topics '
-                'need a row in cg_interfaces/channels.py'
+                f'{body.name}: output {channel!r} is no encoder or tachometer of a joint; its '
+                'topics need a row in cg_interfaces/channels.py'
             )
             raise ValueError(msg)
-        row = tuple(float(i == k) for i in range(count))
-        angles.append(Channel(channel, unit, 'position', driven.get(row, body.coordinates[k])))
+        measured.append(Channel(channel, unit, field, joint_of[row]))
     return Mechanism(
         body.name,
         *_torque_topics(frame, torques),
         (_drive_enabled(frame),),
-        (Topic(topics.JOINT_STATES, JOINT_STATE, frame, tuple(angles)),),
+        (Topic(topics.JOINT_STATES, JOINT_STATE, frame, tuple(measured)),),
     )
 
 

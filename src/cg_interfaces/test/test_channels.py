@@ -4,7 +4,10 @@ from types import SimpleNamespace as Message
 
 import numpy as np
 import pytest
+from cart_pole import CartPole
+from two_joint_arm import TwoJointArm
 
+from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_interfaces import channels
 
 IMU = channels.mechanism('compass_gait').topics['/imu']
@@ -50,6 +53,46 @@ def test_joints_are_found_by_name_not_by_place():
 def test_fewer_values_than_names_are_refused():
     with pytest.raises(ValueError, match='1 values for 2 joint names'):
         channels.extract(Message(name=['shoulder', 'elbow'], position=[1.0]), JOINTS)
+
+
+def test_a_body_outside_the_table_has_the_sensors_of_its_joints():
+    arm = channels.interface(TwoJointArm())
+    assert arm.joints == ('shoulder',)
+    assert [(c.name, c.place) for c in arm.outputs[0].channels] == [
+        ('shoulder_position', 'position[shoulder]'),
+        ('elbow_position', 'position[elbow]'),
+        ('shoulder_velocity', 'velocity[shoulder]'),
+        ('elbow_velocity', 'velocity[elbow]'),
+    ]
+    assert arm.position_of('shoulder_effort') == 'shoulder_position'
+    # The sensor of a joint that is driven has its name, not that of the coordinate.
+    cart = channels.interface(CartPole())
+    assert [c.place for c in cart.outputs[0].channels] == ['position[rail]', 'position[pole]']
+    assert channels.interface(CompassGait()) is channels.mechanism('compass_gait')
+
+
+def test_a_sensor_that_is_none_of_a_joint_needs_a_row():
+    class Walker(CompassGait):
+        name = 'walker'
+
+    with pytest.raises(ValueError, match="walker: output 'imu_angle' is no encoder or tacho"):
+        channels.interface(Walker())
+
+
+def test_effort_stands_beside_the_positions():
+    topic = channels.interface(TwoJointArm()).topics_with_effort['/joint_states']
+    message = Message(
+        name=['gripper', 'elbow', 'shoulder'],
+        position=[9.0, 2.0, 1.0],
+        velocity=[],
+        effort=[9.0, np.nan, 0.5],
+    )
+    assert channels.extract(message, topic) == {
+        'shoulder_position': 1.0,
+        'elbow_position': 2.0,
+        'shoulder_effort': 0.5,
+    }
+    assert '/joint_states' not in channels.mechanism('compass_gait').topics_with_effort
 
 
 def test_unknown_names_list_the_known():

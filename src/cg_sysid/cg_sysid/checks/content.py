@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_interfaces.topics import APPLIED_TORQUE, TORQUE_COMMAND
+from cg_interfaces.topics import APPLIED_TORQUE, JOINT_STATES, TORQUE_COMMAND
 from cg_sysid.checks.signals import Signal
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording
@@ -55,7 +55,7 @@ def check_content(
     if model is not None:
         yield from _model(raw, Path(model))
     yield from _start(raw, signals)
-    rates = {f'{n}_rate': _slope(s) for n, s in signals.items() if n.endswith('angle')}
+    rates = {f'{n}_rate': _slope(s) for n, s in signals.items() if s.is_position}
     yield from _coverage(raw, signals, rates, use_region or {})
     yield from _excitation(raw, signals)
     yield from _closed_loop(raw, signals, rates)
@@ -66,19 +66,27 @@ def _topics(raw: RawRecording) -> Iterator[Finding]:
     known = raw.mechanism
     tied = raw.setup.fixture == 'legs_tied'
     if APPLIED_TORQUE not in raw.topics and not tied:
-        if TORQUE_COMMAND in raw.topics:
+        if raw.torque_topic == TORQUE_COMMAND:
             yield Finding(
                 'topic_missing',
                 'warning',
                 APPLIED_TORQUE,
                 'missing; the torque command is used as the input instead',
             )
+        elif raw.torque_topic:
+            yield Finding(
+                'topic_missing',
+                'info',
+                APPLIED_TORQUE,
+                f'missing; the effort on {raw.torque_topic} is used as the input instead',
+            )
         else:
+            effort = f', nor effort on {JOINT_STATES}' if JOINT_STATES in known.topics else ''
             yield Finding(
                 'topic_missing',
                 'error',
                 APPLIED_TORQUE,
-                f'missing, and there is no {TORQUE_COMMAND} either',
+                f'missing, and there is no {TORQUE_COMMAND} either{effort}',
             )
     present = [topic for topic in known.outputs if topic.name in raw.topics]
     for topic in known.outputs:
@@ -88,6 +96,15 @@ def _topics(raw: RawRecording) -> Iterator[Finding]:
                 'warning' if present else 'error',
                 topic.name,
                 'missing; its channels are ' + ', '.join(c.name for c in topic.channels),
+            )
+    for topic in present:
+        lacking = [c for c in topic.channels if c.name not in raw.topics[topic.name].values]
+        if lacking:
+            yield Finding(
+                'topic_missing',
+                'warning',
+                topic.name,
+                'holds no ' + ', '.join(f'{c.place} ({c.name})' for c in lacking),
             )
 
 
@@ -161,7 +178,7 @@ def _start(raw: RawRecording, signals: dict[str, Signal]) -> Iterator[Finding]:
     begins = {}
     for name in known.output_names:
         signal = signals.get(name)
-        if signal is None or not name.endswith('angle'):
+        if signal is None or not signal.is_position:
             continue
         early = signal.time <= signal.time[0] + START_S
         if early.sum() < 5:
@@ -253,7 +270,7 @@ def _coverage(
                 allowed=WELL_COVERED,
             )
     known = raw.mechanism
-    angles = [signals[n] for n in known.output_names if n in signals and n.endswith('angle')]
+    angles = [s for n, s in signals.items() if n in known.output_names and s.is_position]
     moved = [np.ptp(s.values) > LITTLE_MOTION * max(s.noise.sigma_floor, 1e-6) for s in angles]
     if angles and not any(moved):
         yield Finding(
@@ -321,7 +338,7 @@ def _closed_loop(
             continue
         columns = [np.ones(len(torque.time))]
         for other, signal in signals.items():
-            if other.endswith('angle'):
+            if signal.is_position:
                 columns.append(np.interp(torque.time, signal.time, signal.values))
                 columns.append(np.interp(torque.time, signal.time, rates[f'{other}_rate']))
         design = np.column_stack(columns)

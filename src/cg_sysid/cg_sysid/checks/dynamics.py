@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cg_sysid.checks.law import Law, Motion, fit_law, joint_of, motion_of
+from cg_sysid.checks.law import Law, Motion, fit_law, motion_of
 from cg_sysid.checks.signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.jumps import find_step
@@ -55,7 +55,7 @@ def check_dynamics(
     if motion is None:
         return
     for torque in known.input_names:
-        angle = joint_of(torque)
+        angle = known.position_of(torque)
         if angle not in motion.angle or not drives(wanted, torque):
             continue
         law = fit_law(motion, torque, angle)
@@ -68,7 +68,7 @@ def check_dynamics(
 
 def drives(signals: Mapping[str, Signal], torque: str) -> bool:
     """Whether a torque is there, and makes the motion rather than follows from it."""
-    rms = {n: float(np.std(s.values)) for n, s in signals.items() if n.endswith('torque')}
+    rms = {n: float(np.std(s.values)) for n, s in signals.items() if s.is_torque}
     if rms.get(torque, 0.0) == 0.0:
         return False
     noise = signals[torque].noise.sigma_floor

@@ -94,11 +94,6 @@ class Law:
     wanted: np.ndarray
 
 
-def joint_of(torque: str) -> str:
-    """The angle channel that a torque channel acts on."""
-    return torque.replace('torque', 'angle')
-
-
 def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
     """Averages of torques and moving angles; None where there is nothing to tell.
 
@@ -108,9 +103,9 @@ def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
     moving = {
         name: s
         for name, s in signals.items()
-        if name.endswith('angle') and np.std(s.values) > MOVES * max(s.noise.sigma_floor, 1e-9)
+        if s.is_position and np.std(s.values) > MOVES * max(s.noise.sigma_floor, 1e-9)
     }
-    torques = {name: s for name, s in signals.items() if name.endswith('torque')}
+    torques = {name: s for name, s in signals.items() if s.is_torque}
     every = [*moving.values(), *torques.values()]
     if not moving or not any(np.ptp(s.values) > 0 for s in torques.values()):
         return None

@@ -28,12 +28,12 @@ def resting_band(model: Model, setup: Setup) -> dict[str, float]:
         Output -> rad (m where the joint slides); only outputs that are coordinates. A joint that
         nothing pulls back is left out, as it may rest anywhere.
     """
-    e = assemble(model, setup)
+    e, body = assemble(model, setup), model.mechanism
     m, size = e.coordinates, e.x.numel()
     f = ca.Function('a', [e.x, e.u, e.p], [e.rates[m : 2 * m]])
     stiffness = ca.Function('k', [e.x, e.u, e.p], [ca.jacobian(e.rates[m : 2 * m], e.x)[:, :m]])
     u, p = np.zeros(e.u.numel()), parameter_vector(model, setup)
-    u[len(model.mechanism.inputs) :] = 1.0  # a switch that is not recorded counts as on
+    u[len(body.inputs) :] = 1.0  # a switch that is not recorded counts as on
     x = np.zeros(size)
     pull = np.asarray(stiffness(x, u, p))
     if not np.isfinite(pull).all() or np.linalg.cond(pull) > 1e8:
@@ -44,9 +44,9 @@ def resting_band(model: Model, setup: Setup) -> dict[str, float]:
         slow[m + joint] = SLIDES
         held = 0.5 * np.asarray(f(x + slow, u, p) - f(x - slow, u, p))[:, 0]
         reach += np.abs(np.linalg.solve(pull, held))
-    sensors = np.abs(sensor_matrix(model.mechanism, setup)[:, :m])
+    sensors = np.abs(sensor_matrix(body, setup)[:, :m])
     return {
         name: float(row @ reach)
-        for name, row in zip(model.mechanism.outputs, sensors, strict=True)
-        if name.endswith('angle')
+        for name, row, unit in zip(body.outputs, sensors, body.output_units, strict=True)
+        if unit in ('rad', 'm')
     }

@@ -33,7 +33,7 @@ def check_jitter(signals: Mapping[str, Signal]) -> Iterator[Finding]:
 
 def timing_errors(signals: Mapping[str, Signal]) -> dict[str, TimingError]:
     """Topic -> the error of its timing, where there is one to be seen."""
-    moving = {n: s for n, s in signals.items() if n.endswith(('angle', 'rate'))}
+    moving = {n: s for n, s in signals.items() if s.is_position or s.is_rate}
     found = {
         topic: timing_error({
             n: (s.time, s.values) for n, s in moving.items() if s.topic == topic

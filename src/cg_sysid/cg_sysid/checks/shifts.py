@@ -47,7 +47,7 @@ def check_steps(
     }
     knocks = raw.mechanism.name == CompassGait.name and raw.setup.may_step
     for name, signal in clean.items():
-        if not name.endswith('angle'):
+        if not signal.is_position:
             continue  # a torque may jump, and a rate at a knock
         late = timing[signal.topic].sigma if signal.topic in timing else 0.0
         step = find_step(
@@ -158,7 +158,7 @@ def _others_jump(step: Step, signal: Signal, signals: dict[str, Signal]) -> bool
     """Whether a sensor of another topic jumps too: two zeros do not move at once."""
     usual = float(np.median(np.diff(signal.time)))
     for other in signals.values():
-        if other.topic == signal.topic or other.channel.endswith('rate'):
+        if other.topic == signal.topic or other.is_rate:
             continue
         noise = other.noise
         its = find_step(other.time, other.values, noise.sigma, noise.quantum)

@@ -69,6 +69,21 @@ class Signal:
         """Usual sampling rate in Hz."""
         return 1.0 / float(np.median(np.diff(self.time)))
 
+    @property
+    def is_position(self) -> bool:
+        """Whether it is an angle, or a length along a joint that slides."""
+        return self.unit in ('rad', 'm')
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether it is the rate of one."""
+        return self.unit in ('rad/s', 'm/s')
+
+    @property
+    def is_torque(self) -> bool:
+        """Whether it is a torque, or a force along a joint that slides."""
+        return self.unit in ('N m', 'N')
+
 
 def read_signals(raw: RawRecording) -> dict[str, Signal]:
     """Every channel of a recording that has enough samples to be checked."""

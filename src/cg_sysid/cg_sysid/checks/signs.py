@@ -19,7 +19,7 @@ from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.model import Model
 from cg_sysid.checks.dynamics import drives
 from cg_sysid.checks.kinematics import agreement_of_imu
-from cg_sysid.checks.law import Motion, fit_law, joint_of, motion_of
+from cg_sysid.checks.law import Motion, fit_law, motion_of
 from cg_sysid.checks.signals import Signal
 from cg_sysid.identification.data_set import sensor_matrix
 from cg_sysid.records.findings import Finding
@@ -105,7 +105,7 @@ def _relations(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Rel
     motion = _motion(raw, signals)
     if motion is None:
         return
-    joints = [(torque, joint_of(torque)) for torque in known.input_names]
+    joints = [(torque, known.position_of(torque)) for torque in known.input_names]
     if raw.setup.fixture == 'outer_fixed' and {angle, hip} <= set(motion.angle):
         same = float(np.corrcoef(motion.angle[angle], motion.angle[hip])[0, 1])
         if abs(same) > ONE_ANGLE:

@@ -1,6 +1,6 @@
 """Checks of the stamps: rate, gaps, order, and agreement with the recorder's clock."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -260,9 +260,12 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
     lost = int(np.sum(np.rint(spacing[gaps] / usual[gaps]) - 1))
     share = lost / (len(stamp) + lost)
     worst, unknown, repair = int(gaps[np.argmax(spacing[gaps])]), False, 'they are left out'
-    if topic.name == raw.mechanism.torque.name:
-        unknown, worst, repair = _torque_over(topic, order, gaps, worst)
-    elif share > LOST_SHARE and spacing[worst] > LONG_GAP_S * NS_PER_S:
+    torques = [name for name in raw.mechanism.input_names if name in topic.values]
+    measures = len(topic.values) > len(torques)
+    if torques:
+        unknown, worst, filled = _torque_over(topic, torques, order, gaps, worst)
+        repair = f'{repair}; {filled}' if measures else filled
+    if measures and share > LOST_SHARE and spacing[worst] > LONG_GAP_S * NS_PER_S:
         # A sensor that reports only now and then is read as it comes; one that stops is not.
         unknown = True
     length = spacing[worst] / NS_PER_S
@@ -284,12 +287,12 @@ def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
 
 
 def _torque_over(
-    topic: RawTopic, order: np.ndarray, gaps: np.ndarray, worst: int
+    topic: RawTopic, torques: Sequence[str], order: np.ndarray, gaps: np.ndarray, worst: int
 ) -> tuple[bool, int, str]:
     """Whether a torque is not known somewhere; the worst gap; what is done about the others."""
     stamp = topic.stamp_ns[order]
     filled = 0
-    for values in topic.values.values():
+    for values in (topic.values[name] for name in torques):
         known = torque_gaps(stamp, values[order])
         bad = [gap for gap in known if not gap.known]
         if bad:
@@ -301,8 +304,9 @@ def _torque_over(
             long = stamp[k + 1] - stamp[k] > LONG_GAP_S * NS_PER_S
             if k not in among and long and changed:
                 return True, int(k), ''
-    held = 'the torque is held over the gaps'
-    return False, worst, f'{filled} sample(s) filled from their neighbours' if filled else held
+    if not filled:
+        return False, worst, 'the torque is held over the gaps'
+    return False, worst, f'{filled} sample(s) of the torque filled from their neighbours'
 
 
 def _rate(topic: RawTopic, nominal_hz: object, origin: int) -> Iterator[Finding]:

@@ -103,7 +103,11 @@ def rehearsal(experiment: Experiment, model_file: Path, seed: int) -> Record:
     note = {
         **record.note,
         'initial_state': 'moving' if any(rates) else 'rest',
-        'sensor_zeros': {name: 0.0 for name in record.outputs if name.endswith('angle')},
+        'sensor_zeros': {
+            name: 0.0
+            for name in record.outputs
+            if model.mechanism.output_unit(name) in ('rad', 'm')
+        },
         'zeroed_at': ZEROED_AT,
         'model_file': model_file.name,
         'model_sha256': hashlib.sha256(model_file.read_bytes()).hexdigest(),

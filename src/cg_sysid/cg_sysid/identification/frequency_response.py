@@ -32,6 +32,7 @@ from cg_description.model_file import write_atomically
 from cg_dynamics.linearise import linearise, without_dry_friction
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_interfaces.channels import interface
 from cg_sysid.progress import Bars
 from cg_sysid.records.bags import read_bag
 from cg_sysid.records.record import Record
@@ -314,11 +315,12 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         with Bars('cg frequency-response') as bars:
             bars('reading the recording', 0, 2)
-            record = read_bag(options.bag)
+            model = Model.load(options.model) if options.model else None
+            known = interface(model.mechanism) if model else None
+            record = read_bag(options.bag, mechanism=known)
             bars('finding resonances', 1, 2)
             paths, found = analyse(record)
         effect, why = seat(found)
-        model = Model.load(options.model) if options.model else None
     except (ValueError, OSError) as error:
         print(f'cg frequency-response: error: {error}', file=sys.stderr)
         return 2

@@ -4,11 +4,13 @@ What is harmless is repaired (a repeated message, two messages that overtook eac
 that jumped, a few lost samples of the torque); the rest is refused with one message.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
-from cg_interfaces.topics import APPLIED_TORQUE, TORQUE_COMMAND
+from cg_interfaces.topics import APPLIED_TORQUE, JOINT_STATES, TORQUE_COMMAND
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.clock import mend_clocks
 from cg_sysid.records.raw import RawRecording
@@ -40,7 +42,7 @@ def to_record(
     outputs = {}
     for topic in mechanism.outputs:
         if topic.name in raw.topics:
-            outputs.update(_clean(raw, topic.name))
+            outputs.update(_clean(raw, topic.name, mechanism.output_names))
     if not outputs:
         wanted = ', '.join(topic.name for topic in mechanism.outputs)
         msg = f'{raw.path}: topic missing: no measurement; at least one of {wanted} is needed'
@@ -73,16 +75,16 @@ def _cleaned_inputs(
     torque_topic: str | None,
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Input channel -> (stamps, values); empty where no torque can act."""
-    chosen = torque_topic or (APPLIED_TORQUE if APPLIED_TORQUE in raw.topics else TORQUE_COMMAND)
-    if chosen not in (APPLIED_TORQUE, TORQUE_COMMAND):
-        msg = f'torque_topic is {chosen!r}; allowed: {APPLIED_TORQUE}, {TORQUE_COMMAND}'
+    if torque_topic not in (None, APPLIED_TORQUE, TORQUE_COMMAND):
+        msg = f'torque_topic is {torque_topic!r}; allowed: {APPLIED_TORQUE}, {TORQUE_COMMAND}'
         raise ValueError(msg)
+    chosen = torque_topic or raw.torque_topic
     inputs = {}
     for topic in mechanism.extra_inputs:
         if topic.name in raw.topics:
-            inputs.update(_clean(raw, topic.name))
+            inputs.update(_clean(raw, topic.name, mechanism.extra_input_names))
     if chosen in raw.topics:
-        torques = _clean(raw, chosen)
+        torques = _clean(raw, chosen, mechanism.input_names)
         missing = [name for name in mechanism.input_names if name not in torques]
         if missing:
             place_name = mechanism.channel(missing[0]).place
@@ -92,20 +94,25 @@ def _cleaned_inputs(
         return {**filled, **inputs}
     if setup.fixture == 'legs_tied' and torque_topic is None:
         return inputs  # with the legs tied a hip torque does no work
+    effort = f', or effort on {JOINT_STATES}' if JOINT_STATES in mechanism.topics else ''
     msg = (
         f'{raw.path}: topic missing: '
-        f'{torque_topic or f"{APPLIED_TORQUE} (or {TORQUE_COMMAND})"} is needed; '
+        f'{torque_topic or f"{APPLIED_TORQUE} (or {TORQUE_COMMAND}{effort})"} is needed; '
         f'the bag has {", ".join([*raw.topics, *raw.others]) or "none"}'
     )
     raise RecordingError(msg)
 
 
-def _clean(raw: RawRecording, topic_name: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _clean(
+    raw: RawRecording, topic_name: str, names: Sequence[str]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Channel -> (stamps, values) of one topic, in order of stamps, repeats dropped."""
     samples = raw.topics[topic_name]
     where = f'{raw.path}: topic {topic_name}'
     cleaned = {}
     for name, values in samples.values.items():
+        if name not in names:
+            continue
         keep = ~samples.absent[name]
         bad = np.flatnonzero(keep & ~np.isfinite(values))
         if len(bad):
@@ -118,8 +125,10 @@ def _clean(raw: RawRecording, topic_name: str) -> dict[str, tuple[np.ndarray, np
             raise RecordingError(msg)
         cleaned[name] = _ordered(where, samples.stamp_ns[keep], values[keep])
     if not cleaned:
+        wanted = ', '.join(raw.mechanism.channel(name).place for name in names)
         raise RecordingError(
-            f'{where}: no value that the analysis reads; it has {len(samples)} message(s)'
+            f'{where}: no value that the analysis reads ({wanted}); it has {len(samples)} '
+            'message(s)'
         )
     return cleaned
 

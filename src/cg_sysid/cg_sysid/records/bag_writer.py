@@ -116,11 +116,14 @@ def _compose(store: Any, topic: Topic, stamp_ns: int, row: Mapping[str, float]) 
     if topic.msgtype == IMU:
         return _compose_imu(types, header, topic, row)
     present = [c for c in topic.channels if c.name in row]
-    fields = {
-        name: np.array([row[c.name] for c in present if c.field == name], dtype=float)
-        for name in ('position', 'velocity', 'effort')
-    }
-    return types[topic.msgtype](header=header, name=[c.joint for c in present], **fields)
+    joints = list(dict.fromkeys(c.joint for c in present))
+    fields = {}
+    for name in ('position', 'velocity', 'effort'):
+        of = {c.joint: row[c.name] for c in present if c.field == name}
+        # As many values as names, or none; one that is missing is NaN, as in ros2_control.
+        values = [of.get(joint, np.nan) for joint in joints] if of else []
+        fields[name] = np.array(values, dtype=float)
+    return types[topic.msgtype](header=header, name=joints, **fields)
 
 
 def _compose_imu(types: Any, header: Any, topic: Topic, row: Mapping[str, float]) -> Any:

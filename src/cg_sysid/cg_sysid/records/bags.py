@@ -7,6 +7,7 @@ axis. `read_bag` does both; `write_bag` goes the other way.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from cg_description.reading import parse_yaml, read_text
 from cg_description.schema import Mapping as Form
 from cg_interfaces import channels
 from cg_interfaces.channels import STRING, Topic
-from cg_interfaces.topics import EXPERIMENT
+from cg_interfaces.topics import EXPERIMENT, JOINT_STATES
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.alignment import to_record
 from cg_sysid.records.bag_integrity import no_bag, require_sound, unfinished
@@ -54,7 +55,7 @@ def read_bag(
         path: Bag directory (or a single .mcap or .db3 file).
         note: Recording note for a bag that carries none; its entries go before those in the bag.
         torque_topic: `/applied_torque` or `/torque_command`; the default is the applied torque
-            where the bag has it, the command otherwise.
+            where the bag has it, else the command, else the effort on `/joint_states`.
         shared_row_ns: Samples of different topics this close in ns share a row.
         mechanism: See `read_raw`.
 
@@ -110,7 +111,9 @@ def _read_open(
         raise RecordingError(f'{path}: empty; the bag holds no message')
     merged_note = {**_read_note(path, reader), **(note or {})}
     mechanism = _mechanism_of(path, merged_note, of_model)
-    topics = mechanism.topics
+    recorded = {c.topic for c in reader.connections}
+    has_torque = recorded & {mechanism.torque.name, mechanism.command.name}
+    topics = mechanism.topics if has_torque else mechanism.topics_with_effort
     used = [c for c in reader.connections if c.topic in topics]
     for connection in used:
         expected = topics[connection.topic].msgtype
@@ -150,7 +153,9 @@ def _raw_topic(topic: Topic, rows: list[tuple[int, int, dict[str, float]]]) -> R
     values, absent = {}, {}
     for channel in topic.channels:
         column = [row[2].get(channel.name) for row in rows]
-        if all(value is None for value in column):
+        # What a joint does not report, ros2_control's broadcaster fills with NaN throughout.
+        filled = topic.name == JOINT_STATES and channel.field != 'position'
+        if all(value is None or (filled and isnan(value)) for value in column):
             continue
         absent[channel.name] = np.array([value is None for value in column], dtype=bool)
         values[channel.name] = np.array([nan if v is None else v for v in column], dtype=float)

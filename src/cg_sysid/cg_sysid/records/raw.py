@@ -26,6 +26,7 @@ NOTE = Mapping({
     'model_sha256': Key(Text(), default=''),
     'software': Key(Text(), default=''),
     'recording': Key(Text(), default=''),
+    'effort': Key(Text(('measured', 'commanded')), default='measured'),
     'closed_loop': Key(Flag(), default=False),
     'notes': Key(Text(), default=''),
     'imported_from': Key(Mapping({}, further=True), default={}),
@@ -83,6 +84,15 @@ class RawRecording:
     def name(self) -> str:
         """Short name of the recording."""
         return Path(self.path).name
+
+    @property
+    def torque_topic(self) -> str | None:
+        """The topic that the torque is read from; None if there is none."""
+        for topic in (self.mechanism.torque, self.mechanism.command):
+            if topic.name in self.topics:
+                return topic.name
+        names = {*self.mechanism.input_names}
+        return next((name for name, t in self.topics.items() if names & t.values.keys()), None)
 
     @property
     def setup(self) -> Setup:
