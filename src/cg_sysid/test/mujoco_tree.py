@@ -122,17 +122,26 @@ def record(
     position, effort = np.zeros((2, rows, len(joints)))
     pipe: list[np.ndarray] = []  # what was told before each step of the engine
     late = round(secret.delay / ENGINE)
-    for k in range(rows):
-        q, v = data.qpos[place].copy(), data.qvel[place].copy()
-        position[k], effort[k] = q, command(time[k], q, v)
-        for i in range(steps if k + 1 < rows else 0):
-            pipe.append(effort[k])
-            told = pipe[max(0, len(pipe) - 1 - late)]
-            now = time[k] + i * ENGINE
-            q, v = data.qpos[place], data.qvel[place]
-            delivered = secret.delivered(now, told)
-            data.qfrc_applied[place] = delivered + secret.torque(now, q, v, delivered)
-            mujoco.mj_step(model, data)
+    held = np.zeros(len(joints))
+
+    def forces(model: 'mujoco.MjModel', data: 'mujoco.MjData') -> None:
+        # At each stage of a step: a law held over a step would lag by half of it.
+        more = secret.torque(data.time, data.qpos[place], data.qvel[place], held)
+        data.qfrc_passive[place] += more
+
+    mujoco.set_mjcb_passive(forces)
+    try:
+        for k in range(rows):
+            position[k] = data.qpos[place]
+            effort[k] = command(time[k], position[k], data.qvel[place].copy())
+            for i in range(steps if k + 1 < rows else 0):
+                pipe.append(effort[k])
+                told = pipe[max(0, len(pipe) - 1 - late)]
+                held[:] = secret.delivered(time[k] + i * ENGINE, told)
+                data.qfrc_applied[place] = held
+                mujoco.mj_step(model, data)
+    finally:
+        mujoco.set_mjcb_passive(None)
     random = np.random.default_rng(seed)
     seen = secret.read(time, position) + noise * random.standard_normal(position.shape)
     if counts:

@@ -5,7 +5,9 @@ rates. That relation is fitted as
 
     d2(angle)/dt2 = a torque + b . (1, sin angle, sin 2 angle, cos angle, rate, sign of the rate)
 
-with the angles and rates of every joint. Derivatives of noisy samples are never taken: both sides
+with the angles and rates of every joint. Where bodies hang on each other (`coupled`) sums and
+differences of angles, torques through cos and sin of an angle and products of rates come in too.
+Derivatives of noisy samples are never taken: both sides
 are averaged with a smooth weight of compact support, and integration by parts moves the
 derivatives to the weight (weak form). The torque's factor a is an inverse inertia and so positive
 whatever the robot, and the law is the same from the first second to the last.
@@ -39,6 +41,7 @@ class Motion:
         rate: Angle channel -> average rate in rad/s.
         acceleration: Angle channel -> average acceleration in rad/s^2.
         half_width: Half the length of an average in s.
+        coupled: Whether joints carry each other, so that the law of one needs those of all.
     """
 
     time: np.ndarray
@@ -47,6 +50,7 @@ class Motion:
     rate: Mapping[str, np.ndarray]
     acceleration: Mapping[str, np.ndarray]
     half_width: float
+    coupled: bool = False
 
     def mirrored(self, channels: tuple[str, ...], since: float = -np.inf) -> 'Motion':
         """The same with the opposite sign of some channels from an instant on."""
@@ -94,11 +98,12 @@ class Law:
     wanted: np.ndarray
 
 
-def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
+def motion_of(signals: Mapping[str, Signal], coupled: bool = False) -> Motion | None:
     """Averages of torques and moving angles; None where there is nothing to tell.
 
     Args:
         signals: Channel -> samples.
+        coupled: As of `Motion`.
     """
     moving = {
         name: s
@@ -129,6 +134,7 @@ def motion_of(signals: Mapping[str, Signal]) -> Motion | None:
         rate={n: average(v, 1) for n, v in sampled.items()},
         acceleration={n: average(v, 2) for n, v in sampled.items()},
         half_width=reach * spacing,
+        coupled=coupled and len(moving) > 1,
     )
 
 
@@ -162,6 +168,8 @@ def fit_law(
         usual = max(float(np.sqrt(np.mean(rate**2))), 1e-12)
         columns += [np.sin(value), np.sin(2 * value), np.cos(value), rate]
         columns += [np.tanh(rate / (share * usual)) for share in SLIDING]
+    if motion.coupled:
+        columns += _couplings(motion)
     design = np.column_stack(columns)[rows]
     size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     inverse = np.linalg.pinv(design / size, rcond=NEGLIGIBLE)
@@ -191,6 +199,21 @@ def fit_law(
         rest=rest,
         wanted=wanted,
     )
+
+
+def _couplings(motion: Motion) -> list[np.ndarray]:
+    """What joints that carry each other do to one another, to second order in rates."""
+    names = _distinct(motion)
+    waves = [f(motion.angle[name]) for name in names for f in (np.cos, np.sin)]
+    columns = [wave * torque for wave in waves for torque in motion.torque.values()]
+    for k, a in enumerate(names):
+        for b in names[k:]:
+            rates = motion.rate[a] * motion.rate[b]
+            columns += [wave * rates for wave in (1.0, *waves)]
+            if b != a:
+                both = motion.angle[a] + motion.angle[b], motion.angle[a] - motion.angle[b]
+                columns += [f(angle) for angle in both for f in (np.sin, np.cos)]
+    return columns
 
 
 def _distinct(motion: Motion) -> list[str]:

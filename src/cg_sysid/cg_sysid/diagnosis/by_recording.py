@@ -108,9 +108,10 @@ def numbers_of(
         if name not in LIBRARY:
             continue
         kind = LIBRARY[name]
-        own = any(p.each for p in kind.parameters)
-        plain = not (own or kind.states or kind.extra_inputs) and kind.parameters[0].neutral == 0.0
-        if plain and sum(p.free for p in kind.parameters) == 1:
+        parameters = kind.parameters_in(model.mechanism)
+        own = any(p.each for p in parameters)
+        plain = not (own or kind.states or kind.extra_inputs) and parameters[0].neutral == 0.0
+        if plain and sum(p.free for p in parameters) == 1:
             yield name, at
 
 

@@ -11,6 +11,7 @@ from cg_dynamics.effects.effect import CLOCKS, TIME
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
+from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
@@ -184,7 +185,7 @@ def _as_cause(task: Task) -> Task:
     if task.effect is None or not task.bounds:
         return task
     own = f'{_label(task)}.'
-    shapes = {f'{own}{p.name}': p.leeway for p in LIBRARY[task.effect[0]].parameters if p.leeway}
+    shapes = {f'{own}{p.name}': p.leeway for p in _declared(task) if p.leeway}
     others = {n: b for n, b in task.bounds.items() if not n.startswith(own)}
     return replace(task, bounds=others | shapes)
 
@@ -391,11 +392,16 @@ def _whole(
     )  # fmt: skip
 
 
+def _declared(task: Task) -> tuple[Parameter, ...]:
+    """Parameters of the effect that is tried."""
+    return LIBRARY[task.effect[0]].parameters_in(task.model.mechanism) if task.effect else ()
+
+
 def eventful(task: Task) -> bool:
     """Whether the effect is one of which every record has its own."""
     if task.effect is None:
         return False
-    return any(p.each == 'record' for p in LIBRARY[task.effect[0]].parameters)
+    return any(p.each == 'record' for p in _declared(task))
 
 
 def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
@@ -670,7 +676,7 @@ def too_small(o: Outcome) -> list[str]:
     kind = LIBRARY.get(o.label.partition('@')[0])
     if kind is None:
         return []
-    first = kind.parameters[0]
+    first = kind.parameters_in(o.model.mechanism)[0]
     if first.neutral is None or not np.isfinite(first.neutral) or first.each:
         return []
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
@@ -687,9 +693,9 @@ def undetermined_size(o: Outcome) -> list[str]:
     A limit that was never reached, a stiffness that nothing bends: what acts is something else.
     """
     kind = LIBRARY.get(o.label.partition('@')[0])
-    if kind is None or f'{o.label}.{kind.parameters[0].name}' not in o.train.undetermined:
+    name = kind.parameters_in(o.model.mechanism)[0].name if kind else ''
+    if f'{o.label}.{name}' not in o.train.undetermined:
         return []
-    name = kind.parameters[0].name
     return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
 
 
@@ -715,12 +721,9 @@ def at_edge(o: Outcome) -> list[str]:
     """
     found = []
     kind = LIBRARY.get(o.label.partition('@')[0])
-    optional = (
-        {f'{o.label}.{p.name}' for p in kind.parameters[1:] if p.neutral == p.lower}
-        if kind
-        else set()
-    )
-    ends = {f'{o.label}.{p.name}': p.ends for p in kind.parameters} if kind else {}
+    declared = kind.parameters_in(o.model.mechanism) if kind else ()
+    optional = {f'{o.label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
+    ends = {f'{o.label}.{p.name}': p.ends for p in declared}
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):
         if u.name in o.task.bounds or not u.name.startswith(f'{o.label}.'):
             continue
