@@ -92,7 +92,7 @@ def said(sigma):
     options = {**BODIES['double pendulum'], **SENSORS['noise']}
     data_sets = [t for s in (1, 2) for t in data_set(recording(s, sigma, **options), f'r{s}')]
     outputs = mechanism('double_pendulum').output_names
-    return late_samples(data_sets, 'double_pendulum', outputs, outputs[1], 'rad')
+    return late_samples(data_sets, mechanism('double_pendulum'), outputs, outputs[1], 'rad')
 
 
 def test_an_unexplained_error_is_told_what_timing_makes_of_it():

@@ -8,6 +8,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
+from cg_interfaces.channels import interface
 from cg_sysid.deadline import OutOfTime
 from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.diagnosis.by_recording import what_wanders
@@ -139,7 +140,7 @@ def told_late_samples(work: Workspace, gains: Sequence[Gain]) -> str:
     worst = max(gains, key=lambda g: g.before / g.noise)
     body = work.nominal.mechanism
     return late_samples(
-        (*work.train, *work.held), body.name, body.outputs, worst.channel, worst.unit
+        (*work.train, *work.held), interface(body), body.outputs, worst.channel, worst.unit
     )
 
 

@@ -4,19 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cg_interfaces.channels import mechanism
+from cg_interfaces.channels import Mechanism
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.records.jitter import timing_error
 
 
 def late_samples(
-    data_sets: Sequence[DataSet], body: str, outputs: Sequence[str], output: str, unit: str
+    data_sets: Sequence[DataSet], robot: Mechanism, outputs: Sequence[str], output: str, unit: str
 ) -> str:
     """That samples were taken beside their stamps, and the error that this makes, in a sentence.
 
     Args:
         data_sets: Records, or windows of them.
-        body: Name of the mechanism.
+        robot: Its topics tell which outputs are of one sensor.
         outputs: Names of the columns of the data sets' outputs.
         output: The one whose error is told.
         unit: Its unit.
@@ -24,7 +24,7 @@ def late_samples(
     Returns:
         The sentence; empty where most recordings show no such thing.
     """
-    sensor = next(t for t in mechanism(body).outputs if output in {c.name for c in t.channels})
+    sensor = next(t for t in robot.outputs if output in {c.name for c in t.channels})
     names = [c.name for c in sensor.channels if c.name in outputs]
     found, made = [], []
     recordings = sorted({data_set.recording for data_set in data_sets})
