@@ -23,7 +23,7 @@ from cg_dynamics.assemble import acting_effects, parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
-from cg_sysid.identification import kept_fits
+from cg_sysid.identification import kept_fits, torque_error
 from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
@@ -254,7 +254,8 @@ def fit(
         reweight: Let the weights follow the residual that is left.
         horizon: Use only this much of each record, in s: a cheap first look.
         start: Set out from this fit of the same unknowns to a shorter horizon instead.
-        at: Set out from these values (full name -> value) instead of those of the file.
+        at: Set out from these values (full name -> value) instead of those of the file; without
+            them a robot of a URDF sets out from what its torques say (torque_error.py).
         own: Name of a data set -> first guesses, by full name, of what it has beyond its
             initial motion (`own_unknowns`); without one the model's value is the guess.
         bounds: Parameters that stay near the model's value (`unknowns_of`).
@@ -276,6 +277,9 @@ def fit(
     problem = Problem(
         model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement
     )
+    if start is None and at is None and torque_error.can(model):
+        found = torque_error.fit_by_torque(model, data_sets, only, bounds)
+        at = found.values if found else None
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motions = list(problem.guesses if start is None else start.motions)

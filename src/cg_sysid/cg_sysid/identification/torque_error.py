@@ -1,0 +1,304 @@
+"""Identification by torque error: what a measured motion takes, less what acted.
+
+    r_k = S^-1 (Q(x_k, u_k, p) - ID(q_k, v_k, a_k, p)),   x_k = (q_k, v_k) and a_k measured   (TE)
+
+Nothing is simulated, so that no start is too far off and nothing runs away: an arm of six joints
+is fitted in a second. In return it is biased: derivatives of samples are smoothed, sensors that are
+late or wrong count as right, and states that no sensor reads are left out. So it says where a fit
+by simulation error sets out, and which candidates are worth one (theory.md, ID).
+
+Position, rate and acceleration come from local polynomials; the torques are averaged with the same
+weights, so that both sides have seen the same window.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import Equations, assemble, parameter_vector
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.unknowns import Unknown, unknowns_of
+
+HALF_WIDTH_S = 0.06  # of the window of a local polynomial: motions up to some 5 Hz
+LEAST_HALF_WIDTH = 3  # samples
+DEGREE = 4  # of the polynomial
+STRIDE_S = 0.04  # between rows: windows that share less than half of their samples
+ITERATIONS = 25
+SETTLED = 1e-4  # relative change of the cost
+DAMPING = 1e-3  # Levenberg-Marquardt, at first
+MOST_DAMPING = 1e6
+CAP = 4.0  # standard deviations from which a row counts less: rates that turn within a window
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What was measured of one data set, at rows STRIDE_S apart.
+
+    Attributes:
+        position: Free coordinates, shape (k, m).
+        rate: Shape (k, m).
+        acceleration: Shape (k, m).
+        inputs: Averages, shape (k, nu).
+        setup: The set-up.
+    """
+
+    position: np.ndarray
+    rate: np.ndarray
+    acceleration: np.ndarray
+    inputs: np.ndarray
+    setup: Setup
+
+
+@dataclass(frozen=True)
+class TorqueFit:
+    """What the torques say.
+
+    Attributes:
+        values: Full parameter name -> value.
+        rms: Of the residual of each free coordinate, N m (N), shape (m,).
+        relative: That over the torque that acted there, shape (m,); NaN where nothing drives.
+        cost: Sum of squared residuals over `scale`, large ones capped, and of the belief.
+        rows: Number of rows.
+    """
+
+    values: Mapping[str, float]
+    rms: np.ndarray
+    relative: np.ndarray
+    cost: float
+    rows: int
+
+
+def can(model: Model) -> bool:
+    """Whether every coordinate of a model is measured by an encoder of its own."""
+    encoders = sum(kind == 'encoder' for kind in model.mechanism.sensor_kinds.values())
+    return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
+
+
+def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion | None:
+    """The measured motion of a data set; None where it is too short or samples are missing.
+
+    Args:
+        model: Its mechanism counts.
+        data_set: The record.
+        names: Inputs wanted.
+    """
+    body = model.mechanism
+    kinematics = body.kinematics(data_set.setup)
+    basis = np.asarray(kinematics.basis)
+    offset = np.broadcast_to(np.asarray(kinematics.offset).ravel(), (len(basis),))
+    count = len(body.coordinates)
+    seen = data_set.outputs[:, :count]
+    spacing = float(np.median(np.diff(data_set.time)))
+    half = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
+    grid = np.arange(0.0, data_set.duration, spacing)
+    if len(grid) <= 2 * half + 1:
+        return None
+    place, rate, acceleration = (_weights(half, spacing, order) for order in range(3))
+    stride = max(1, round(STRIDE_S / spacing))
+    free = np.linalg.pinv(basis)
+    angles = []
+    for channel in seen.T:
+        there = np.isfinite(channel)
+        if there.sum() <= 2 * half + 1:
+            return None
+        angles.append(np.interp(grid, data_set.time[there], channel[there]))
+    s = (np.column_stack(angles) - offset) @ free.T
+    row = np.clip(np.searchsorted(data_set.time, grid, side='right') - 1, 0, None)
+    inputs = data_set.inputs_for(names)[row]
+
+    def over(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        columns = [np.correlate(column, weights, 'valid')[::stride] for column in values.T]
+        return np.column_stack(columns)
+
+    return Motion(
+        over(s, place), over(s, rate), over(s, acceleration), over(inputs, place), data_set.setup
+    )
+
+
+def _weights(half: int, spacing: float, order: int) -> np.ndarray:
+    """Weights of samples that give a derivative at the middle of a local polynomial."""
+    t = np.arange(-half, half + 1) * spacing
+    design = np.vander(t / t[-1], DEGREE + 1, increasing=True)
+    factor = (1.0, 1.0, 2.0)[order] / t[-1] ** order
+    return factor * np.linalg.pinv(design)[order]
+
+
+def fit_by_torque(
+    model: Model,
+    data_sets: Sequence[DataSet],
+    only: Sequence[str] | None = None,
+    bounds: Mapping[str, float] | None = None,
+    scale: np.ndarray | None = None,
+) -> TorqueFit | None:
+    """Identify what the torques show of a model; None where no record can be used.
+
+    Args:
+        model: What is believed, and where the search sets out.
+        data_sets: Prepared records.
+        only: As of `identify.fit`.
+        bounds: As of `identify.fit`.
+        scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,), by which
+            fits are compared; by default what is left of this one.
+    """
+    plain = _without_states(model)
+    declared = plain.declarations
+    unknowns = tuple(u for u in unknowns_of(model, only, bounds) if u.name in declared)
+    problems = _problems(plain, data_sets, unknowns)
+    if not problems:
+        return None
+    theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
+    prior = theta.copy()
+    tolerance = np.array([u.tolerance for u in unknowns])
+    own_scale = scale is None
+    residual, jacobian = _evaluated(problems, unknowns, theta)
+    if scale is None:
+        scale = _spread(residual)
+    damping, cost = DAMPING, _cost(residual, scale, theta, prior, tolerance)
+    for _ in range(ITERATIONS):
+        weight = 1 / np.maximum(1.0, np.abs(residual / scale) / CAP)
+        r = (weight * residual / scale).ravel()
+        j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
+        h = j.T @ j + np.diag(1 / tolerance**2)
+        g = j.T @ r + (theta - prior) / tolerance**2
+        better = False
+        while not better and damping < MOST_DAMPING:
+            step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-12), -g, rcond=None)[0]
+            tried = np.array([
+                np.clip(t + s, *_range(u)) for t, s, u in zip(theta, step, unknowns, strict=True)
+            ])  # fmt: skip
+            new_residual, new_jacobian = _evaluated(problems, unknowns, tried)
+            new_cost = _cost(new_residual, scale, tried, prior, tolerance)
+            better = new_cost < cost
+            damping = damping / 5 if better else 5 * damping
+        if not better:
+            break
+        settled = cost - new_cost < SETTLED * cost
+        theta, residual, jacobian, cost = tried, new_residual, new_jacobian, new_cost
+        if own_scale:
+            scale = _spread(residual)
+            cost = _cost(residual, scale, theta, prior, tolerance)
+        if settled:
+            break
+    acted = np.sqrt(np.mean(np.vstack([p.acted for p in problems]) ** 2, axis=0))
+    rms = np.sqrt(np.mean(residual**2, axis=0))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        relative = np.where(acted > 0, rms / acted, np.nan)
+    values = {u.name: u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)}
+    return TorqueFit(values, rms, relative, cost, len(residual))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Motions of one set-up, and (TE) for them as a function of (x, u, a, p)."""
+
+    function: ca.Function
+    motion: Motion
+    vector: np.ndarray
+    places: list[int]
+    acted: np.ndarray
+
+
+def _problems(
+    model: Model, data_sets: Sequence[DataSet], unknowns: Sequence[Unknown]
+) -> list[_Problem]:
+    by_setup: dict[Setup, list[DataSet]] = {}
+    for data_set in data_sets:
+        by_setup.setdefault(data_set.setup, []).append(data_set)
+    found = []
+    for setup, own in by_setup.items():
+        e = assemble(model, setup)
+        motions = [motion_of(model, data_set, e.input_names) for data_set in own]
+        usable = [motion for motion in motions if motion is not None]
+        if not usable:
+            continue
+        every = Motion(
+            *(np.vstack([getattr(m, name) for m in usable])
+              for name in ('position', 'rate', 'acceleration', 'inputs')),
+            setup,
+        )  # fmt: skip
+        places = [e.parameter_names.index(u.name) for u in unknowns]
+        found.append(
+            _Problem(
+                _function(e, places), every, parameter_vector(model, setup), places,
+                _acted(model, e, every),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _function(e: Equations, places: list[int]) -> ca.Function:
+    """(TE) and its derivative by some of the parameters."""
+    moved = ca.vertcat(*(e.p[k] for k in places)) if places else ca.SX(0, 1)
+    return ca.Function(
+        'torque_error',
+        [e.x, e.u, e.acceleration, e.p],
+        [ca.cse(ca.densify(x)) for x in (e.imbalance, ca.jacobian(e.imbalance, moved))],
+    )
+
+
+def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
+    """Torque that was applied on each free coordinate, shape (k, m)."""
+    body = model.mechanism
+    basis = np.asarray(body.kinematics(motion.setup).basis)
+    rows = np.array([body.joints[joint] for joint in body.joints])
+    return motion.inputs[:, : len(rows)] @ rows @ basis
+
+
+def _evaluated(
+    problems: Sequence[_Problem], unknowns: Sequence[Unknown], theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (rows, m) and their derivative by the coordinates (rows, m, unknowns)."""
+    residuals, jacobians = [], []
+    values = np.array([u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)])
+    slope = np.array([v if u.logarithmic else 1.0 for v, u in zip(values, unknowns, strict=True)])
+    for problem in problems:
+        p, motion = problem.vector.copy(), problem.motion
+        p[problem.places] = values
+        k, m = motion.position.shape
+        x = np.hstack([motion.position, motion.rate]).T
+        r, j = problem.function.map(k)(x, motion.inputs.T, motion.acceleration.T, p)
+        residuals.append(np.asarray(r).T)
+        by = np.asarray(j).reshape(m, k, len(unknowns)).transpose(1, 0, 2)
+        jacobians.append(by * slope)
+    return np.vstack(residuals), np.vstack(jacobians)
+
+
+def _range(u: Unknown) -> tuple[float, float]:
+    if not u.logarithmic:
+        return u.lower, u.upper
+    return u.to_coordinate(max(u.lower, 1e-300)), u.to_coordinate(u.upper)
+
+
+def _spread(residual: np.ndarray) -> np.ndarray:
+    """Standard deviation of most of the rows, shape (m,)."""
+    return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
+
+
+def _cost(
+    residual: np.ndarray,
+    scale: np.ndarray,
+    theta: np.ndarray,
+    prior: np.ndarray,
+    tolerance: np.ndarray,
+) -> float:
+    """Squares near zero, straight on beyond CAP (Huber), and the belief."""
+    size = np.abs(residual / scale)
+    capped = np.where(size <= CAP, size**2, CAP * (2 * size - CAP))
+    return float(capped.sum() + (((theta - prior) / tolerance) ** 2).sum())
+
+
+def _without_states(model: Model) -> Model:
+    """The model less what has states of its own, of which something simpler may be left."""
+    for effect in model.effects:
+        if not effect.states:
+            continue
+        simpler = effect.without_states(model.values_of(effect))
+        model = model.without_effect(effect.label)
+        for name, values in simpler.items():
+            if all(e.label != f'{name}@{effect.at}' and e.name != name for e in model.effects):
+                model = model.with_effect(name, effect.at, **values)
+    return model
