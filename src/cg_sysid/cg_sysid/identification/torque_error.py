@@ -3,9 +3,9 @@
     r_k = S^-1 (Q(x_k, u_k, p) - ID(q_k, v_k, a_k, p)),   x_k = (q_k, v_k) and a_k measured   (TE)
 
 Nothing is simulated, so that no start is too far off and nothing runs away: an arm of six joints
-is fitted in a second. In return it is biased: derivatives of samples are smoothed, sensors that are
-late or wrong count as right, and states that no sensor reads are left out. So it says where a fit
-by simulation error sets out, and which candidates are worth one (theory.md, ID).
+is fitted in a second. In return it is biased: derivatives of samples are smoothed, sensors that
+are late or wrong count as right, and states that no sensor reads are left out. So it says where a
+fit by simulation error sets out, and which candidates are worth one (theory.md, ID).
 
 Position, rate and acceleration come from local polynomials; the torques are averaged with the same
 weights, so that both sides have seen the same window.
@@ -144,19 +144,19 @@ def fit_by_torque(
         scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,), by which
             fits are compared; by default what is left of this one.
     """
-    plain = _without_states(model)
+    plain = without_states(model)
     declared = plain.declarations
     unknowns = tuple(u for u in unknowns_of(model, only, bounds) if u.name in declared)
-    problems = _problems(plain, data_sets, unknowns)
+    problems = problems_of(plain, data_sets, unknowns)
     if not problems:
         return None
     theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
     prior = theta.copy()
     tolerance = np.array([u.tolerance for u in unknowns])
     own_scale = scale is None
-    residual, jacobian = _evaluated(problems, unknowns, theta)
+    residual, jacobian = evaluated(problems, unknowns, theta)
     if scale is None:
-        scale = _spread(residual)
+        scale = spread_of(residual)
     damping, cost = DAMPING, _cost(residual, scale, theta, prior, tolerance)
     for _ in range(ITERATIONS):
         weight = 1 / np.maximum(1.0, np.abs(residual / scale) / CAP)
@@ -170,7 +170,7 @@ def fit_by_torque(
             tried = np.array([
                 np.clip(t + s, *_range(u)) for t, s, u in zip(theta, step, unknowns, strict=True)
             ])  # fmt: skip
-            new_residual, new_jacobian = _evaluated(problems, unknowns, tried)
+            new_residual, new_jacobian = evaluated(problems, unknowns, tried)
             new_cost = _cost(new_residual, scale, tried, prior, tolerance)
             better = new_cost < cost
             damping = damping / 5 if better else 5 * damping
@@ -179,7 +179,7 @@ def fit_by_torque(
         settled = cost - new_cost < SETTLED * cost
         theta, residual, jacobian, cost = tried, new_residual, new_jacobian, new_cost
         if own_scale:
-            scale = _spread(residual)
+            scale = spread_of(residual)
             cost = _cost(residual, scale, theta, prior, tolerance)
         if settled:
             break
@@ -192,9 +192,10 @@ def fit_by_torque(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
     """Motions of one set-up, and (TE) for them as a function of (x, u, a, p)."""
 
+    equations: Equations
     function: ca.Function
     motion: Motion
     vector: np.ndarray
@@ -202,9 +203,10 @@ class _Problem:
     acted: np.ndarray
 
 
-def _problems(
+def problems_of(
     model: Model, data_sets: Sequence[DataSet], unknowns: Sequence[Unknown]
-) -> list[_Problem]:
+) -> list[Problem]:
+    """What is measured, by set-up; unknowns are those of a model without states."""
     by_setup: dict[Setup, list[DataSet]] = {}
     for data_set in data_sets:
         by_setup.setdefault(data_set.setup, []).append(data_set)
@@ -216,14 +218,14 @@ def _problems(
         if not usable:
             continue
         every = Motion(
-            *(np.vstack([getattr(m, name) for m in usable])
-              for name in ('position', 'rate', 'acceleration', 'inputs')),
+            np.vstack([m.position for m in usable]), np.vstack([m.rate for m in usable]),
+            np.vstack([m.acceleration for m in usable]), np.vstack([m.inputs for m in usable]),
             setup,
         )  # fmt: skip
         places = [e.parameter_names.index(u.name) for u in unknowns]
         found.append(
-            _Problem(
-                _function(e, places), every, parameter_vector(model, setup), places,
+            Problem(
+                e, _function(e, places), every, parameter_vector(model, setup), places,
                 _acted(model, e, every),
             )
         )  # fmt: skip
@@ -248,8 +250,8 @@ def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
     return motion.inputs[:, : len(rows)] @ rows @ basis
 
 
-def _evaluated(
-    problems: Sequence[_Problem], unknowns: Sequence[Unknown], theta: np.ndarray
+def evaluated(
+    problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (rows, m) and their derivative by the coordinates (rows, m, unknowns)."""
     residuals, jacobians = [], []
@@ -273,7 +275,7 @@ def _range(u: Unknown) -> tuple[float, float]:
     return u.to_coordinate(max(u.lower, 1e-300)), u.to_coordinate(u.upper)
 
 
-def _spread(residual: np.ndarray) -> np.ndarray:
+def spread_of(residual: np.ndarray) -> np.ndarray:
     """Standard deviation of most of the rows, shape (m,)."""
     return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
 
@@ -291,7 +293,7 @@ def _cost(
     return float(capped.sum() + (((theta - prior) / tolerance) ** 2).sum())
 
 
-def _without_states(model: Model) -> Model:
+def without_states(model: Model) -> Model:
     """The model less what has states of its own, of which something simpler may be left."""
     for effect in model.effects:
         if not effect.states:
@@ -302,3 +304,12 @@ def _without_states(model: Model) -> Model:
             if all(e.label != f'{name}@{effect.at}' and e.name != name for e in model.effects):
                 model = model.with_effect(name, effect.at, **values)
     return model
+
+
+def noise_gains(spacing: float) -> tuple[float, float, float]:
+    """Noise of position, rate and acceleration over that of a sample, 1, 1/s and 1/s^2."""
+    half = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
+    place, rate, acceleration = (
+        float(np.linalg.norm(_weights(half, spacing, order))) for order in range(3)
+    )
+    return place, rate, acceleration

@@ -1,0 +1,295 @@
+"""Which effects could the torques of a robot of many joints know of? A score test before any fit.
+
+About the torque error r of the base (torque_error.py), with J its derivative by the numbers of the
+base and D that by the numbers of one candidate at its start,
+
+    gain = (|P r|^2 - min_d |P (r + D d)|^2) / 2,    P: without what J and its belief explain
+
+in standard deviations of what the base leaves. D costs no fit and no compilation:
+
+    a torque on a joint, a body    derivative of its generalised force along the measured motion
+    a sensor                       of the motion that it would make of the measured one
+    a delay                        of the torque by time, or of the motion
+
+What has states of its own, as a flexible drive, has no D; it is looked at on the joints of which
+the torques are worst explained. A robot of six joints has 150 candidates, and a fit of one takes
+seconds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from cg_dynamics.assemble import assemble, parameter_vector
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import CLOCKS
+from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.model import Model
+from cg_sysid.identification import torque_error
+from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.torque_error import Motion, Problem
+from cg_sysid.identification.unknowns import unknowns_of
+from cg_sysid.search.candidates import starts_of
+from cg_sysid.search.nuisance import Bounds
+
+FEWEST_JOINTS = 3  # from which looks at all effects at all joints take too long
+SEEN = 10.0  # nats that a candidate has to gain
+KEPT = 14  # candidates that are looked at, the best first
+NEAR = 0.2  # share of the best one's gain from which one is kept beyond these
+WORST = 2  # joints on which effects with states are looked at
+STEP = 1e-4  # relative, of differences of inputs in time
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What the torques say of candidates.
+
+    Attributes:
+        gains: (effect, place) -> nats that it could gain; of those that have a D.
+        worst: Joints, those of which the torques are worst explained first.
+    """
+
+    gains: dict[tuple[str, str | None], float]
+    worst: tuple[str, ...]
+
+    def worth(self, candidates: Sequence[tuple[str, str | None]]) -> list[tuple[str, str | None]]:
+        """Those to be looked at."""
+        ordered = sorted(self.gains, key=lambda c: -self.gains[c])
+        best = self.gains[ordered[0]] if ordered else 0.0
+        seen = {
+            c
+            for place, c in enumerate(ordered)
+            if self.gains[c] > SEEN and (place < KEPT or self.gains[c] > NEAR * best)
+        }
+        unseen = {
+            (name, at)
+            for name, at in candidates
+            if (name, at) not in self.gains and (at is None or _joint(at) in self.worst[:WORST])
+        }
+        return [c for c in candidates if c in seen or c in unseen]
+
+
+def worth_a_look(
+    model: Model,
+    train: Sequence[DataSet],
+    candidates: Sequence[tuple[str, str | None]],
+    bounds: Bounds,
+) -> list[tuple[str, str | None]]:
+    """The candidates that the torques leave possible, of a robot of many joints; else all."""
+    several = len(model.mechanism.coordinates) >= FEWEST_JOINTS
+    if not several or not torque_error.can(model):
+        return list(candidates)
+    found = scores(model, train, candidates, bounds)
+    return found.worth(candidates) if found else list(candidates)
+
+
+def scores(
+    model: Model,
+    train: Sequence[DataSet],
+    candidates: Sequence[tuple[str, str | None]],
+    bounds: Bounds,
+) -> Scores | None:
+    """What the torques say of candidates on top of a model; None where they say nothing."""
+    plain = torque_error.without_states(model)
+    declared = plain.declarations
+    unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
+    fitted = torque_error.fit_by_torque(model, train, None, bounds)
+    problems = torque_error.problems_of(plain, train, unknowns)
+    if fitted is None or not problems:
+        return None
+    theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
+    prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
+    tolerance = np.array([u.tolerance for u in unknowns])
+    residual, jacobian = torque_error.evaluated(problems, unknowns, theta)
+    scale = torque_error.spread_of(residual)
+    known = (jacobian / scale[:, None]).reshape(residual.size, -1)
+    # The belief is as good as measurements of the numbers themselves.
+    belief = np.diag(1 / tolerance)
+    orthonormal, _ = np.linalg.qr(np.vstack([known, belief[np.isfinite(tolerance)]]))
+    left = np.concatenate([(residual / scale).ravel(), ((theta - prior) / tolerance)[
+        np.isfinite(tolerance)]])  # fmt: skip
+    left = left - orthonormal @ (orthonormal.T @ left)
+    values = plain.with_values(fitted.values)
+    problems = _as_predicted(plain, problems, residual)
+    by_motion = [_by_motion(problem, values) for problem in problems]
+    gains = {}
+    for name, at in candidates:
+        columns = _columns(values, name, at, problems, by_motion)
+        if columns is None:
+            continue
+        best = 0.0
+        for start in columns:
+            d = np.zeros((len(left), start.shape[2]))
+            d[: residual.size] = (start / scale[:, None]).reshape(residual.size, -1)
+            d -= orthonormal @ (orthonormal.T @ d)
+            solution, *_ = np.linalg.lstsq(d, -left, rcond=1e-9)
+            rest = left + d @ solution
+            best = max(best, float(left @ left - rest @ rest) / 2)
+        gains[name, at] = best
+    noise = _noise(model, train, problems, values, by_motion)
+    order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
+    free = [name for name in model.mechanism.kinematics(train[0].setup).names]
+    return Scores(gains, tuple(free[k] for k in order))
+
+
+def _as_predicted(
+    model: Model, problems: Sequence[Problem], residual: np.ndarray
+) -> list[Problem]:
+    """The motions with the torques that the base predicts in place of those measured.
+
+    What acted is measured with noise, and that noise is in r too: a law of the measured torque
+    would explain r by itself.
+    """
+    found, first = [], 0
+    for problem in problems:
+        motion = problem.motion
+        rows = np.array([model.mechanism.joints[joint] for joint in model.mechanism.joints])
+        basis = np.asarray(model.mechanism.kinematics(motion.setup).basis)
+        last = first + len(motion.position)
+        inputs = motion.inputs.copy()
+        error = residual[first:last] @ np.linalg.pinv(rows @ basis)
+        inputs[:, : len(rows)] -= error
+        acted = problem.acted - error @ rows @ basis
+        found.append(replace(problem, motion=replace(motion, inputs=inputs), acted=acted))
+        first = last
+    return found
+
+
+class _Weightless(Urdf):
+    """The joints of a robot without the bodies: what is left of its equations are the forces."""
+
+    def inverse_dynamics(self, q, v, a, p, up):
+        """Nothing has to be moved."""
+        return ca.SX.zeros(q.shape)
+
+    def mass_matrix(self, q, p):
+        """So that the equations can be written down."""
+        return ca.SX.eye(q.shape[0])
+
+    def energies(self, q, v, p, setup, up, foot=None):
+        """None."""
+        return ca.SX(0), ca.SX(0)
+
+
+def _columns(
+    model: Model,
+    name: str,
+    at: str | None,
+    problems: Sequence[Problem],
+    by_motion: Sequence[np.ndarray],
+) -> list[np.ndarray] | None:
+    """D of a candidate at each of its starts, (rows, m, numbers); None where it has none."""
+    kind = LIBRARY[name]
+    effect = kind(model.mechanism, at)
+    if effect.states or set(effect.extra_inputs) & set(CLOCKS) or name == 'ground_slope':
+        return None
+    if any(p.each == 'record' for p in effect.parameters):
+        return None
+    body = model.mechanism
+    assert isinstance(body, Urdf)
+    bare = Model(
+        model.name, _Weightless(body.description, body.driven, body.rates), (),
+        {p.name: model.quantities[p.name] for p in body.parameters}, {}, {}, '', {},
+    )  # fmt: skip
+    # What else acts on the same joint makes the load that some laws follow.
+    for other in model.effects:
+        if other.label != effect.label and other.site == effect.site and not other.states:
+            bare = bare.with_effect(other.name, other.at, **model.values_of(other))
+    found = []
+    for start in starts_of(name, body):
+        acting = bare.with_effect(name, at, **start)
+        columns = [
+            _one_column(acting, effect.label, problem, motion)
+            for problem, motion in zip(problems, by_motion, strict=True)
+        ]
+        found.append(np.concatenate(columns))
+    return found
+
+
+def _one_column(model: Model, label: str, problem: Problem, by_motion: np.ndarray) -> np.ndarray:
+    """D for the motions of one set-up."""
+    motion: Motion = problem.motion
+    e = assemble(model, motion.setup)
+    p = parameter_vector(model, motion.setup)
+    own = [
+        k for k, n in enumerate(e.parameter_names)
+        if n.startswith(f'{label}.') and model.declarations[n].free
+    ]  # fmt: skip
+    moved = ca.vertcat(*(e.p[k] for k in own))
+    m = e.coordinates
+    s, ds, a = e.x[:m], e.x[m : 2 * m], e.acceleration
+    seen = e.outputs[:m] - s if m == len(model.mechanism.coordinates) else ca.SX.zeros(m)
+    seen_rate = ca.jtimes(seen, s, ds)
+    seen_acceleration = ca.jtimes(seen_rate, s, ds) + ca.jtimes(seen_rate, ds, a)
+    # A sensor that shows more than there is: what is there is less than measured.
+    shown = -ca.jacobian(ca.vertcat(seen, seen_rate, seen_acceleration), moved)
+    late = ca.jacobian(ca.vertcat(e.input_delay, e.output_delays[:m]), moved)
+    f = ca.Function(
+        'columns', [e.x, e.u, a, e.p],
+        [ca.densify(x) for x in (ca.jacobian(e.imbalance, moved), shown, late)],
+    )  # fmt: skip
+    k = len(motion.position)
+    x = np.hstack([motion.position, motion.rate]).T
+    u = motion.inputs[:, : e.u.shape[0]].T
+    force, readings, delays = f.map(k)(x, u, motion.acceleration.T, p)
+    force, readings, delays = (
+        np.asarray(part).reshape(part.shape[0], k, len(own)).transpose(1, 0, 2)
+        for part in (force, readings, delays)
+    )
+    found = force + np.einsum('kij,kjc->kic', by_motion, readings)
+    if np.any(delays):
+        rise = _rise(problem.acted, motion)
+        jerk = _rise(motion.acceleration, motion)
+        found = found - delays[:, :1] * rise[:, :, None]
+        ahead = np.hstack([motion.rate, motion.acceleration, jerk])
+        each = np.tile(delays[:, 1:], (1, 3, 1))
+        found = found + np.einsum('kij,kjc->kic', by_motion, each * ahead[:, :, None])
+    return found
+
+
+def _rise(values: np.ndarray, motion: Motion) -> np.ndarray:
+    """Derivative by time along rows, where they follow each other."""
+    rise = np.gradient(values, torque_error.STRIDE_S, axis=0)
+    joins = np.abs(np.diff(motion.position, axis=0)).max(axis=1, initial=0.0)
+    usual = 20 * np.abs(motion.rate).max() * torque_error.STRIDE_S
+    rise[:-1][joins > usual] = 0.0
+    return rise
+
+
+def _by_motion(problem: Problem, model: Model) -> np.ndarray:
+    """Derivative of the torque error by position, rate and acceleration, (rows, m, 3 m)."""
+    e, motion = problem.equations, problem.motion
+    m = e.coordinates
+    every = ca.vertcat(e.x[: 2 * m], e.acceleration)
+    f = ca.Function(
+        'by_motion', [e.x, e.u, e.acceleration, e.p],
+        [ca.cse(ca.densify(ca.jacobian(e.imbalance, every)))],
+    )  # fmt: skip
+    k = len(motion.position)
+    x = np.hstack([motion.position, motion.rate]).T
+    p = parameter_vector(model, motion.setup)
+    found = np.asarray(f.map(k)(x, motion.inputs.T, motion.acceleration.T, p))
+    return found.reshape(m, k, 3 * m).transpose(1, 0, 2)
+
+
+def _noise(
+    model: Model,
+    train: Sequence[DataSet],
+    problems: Sequence[Problem],
+    values: Model,
+    by_motion: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Torque error that the noise of the encoders makes, for each coordinate, N m (N)."""
+    m = by_motion[0].shape[1]
+    sigma = train[0].sigma[:m]
+    spacing = float(np.median(np.diff(train[0].time)))
+    gains = torque_error.noise_gains(spacing)
+    spread = np.concatenate([gain * sigma for gain in gains])
+    return np.sqrt(np.mean(np.vstack([(b**2) @ spread**2 for b in by_motion]), axis=0))
+
+
+def _joint(place: str) -> str:
+    """The joint of a place: of a sensor `JOINT_position`."""
+    return place.removesuffix('_position').removesuffix('_velocity')
