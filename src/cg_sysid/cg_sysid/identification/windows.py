@@ -26,6 +26,7 @@ from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
+from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet, measured_motion, prepare
 from cg_sysid.records.record import Record
 
@@ -103,10 +104,16 @@ def _times(growth: float) -> str:
 
 
 def followed(model: Model, records: Sequence[Record]) -> tuple[Followed, ...]:
-    """How far each record is followed along a model; to its end if the model cannot say."""
-    return tuple(
-        _followed(model, data_set) for data_set in (prepare(model, records) if records else ())
-    )
+    """How far each record is followed along a model; to its end if the model cannot say.
+
+    Of a robot of a URDF the model is one that its torques agree with (torque_error.py): friction
+    that the file does not know would hold the motion, or let it go.
+    """
+    data_sets = prepare(model, records) if records else []
+    if data_sets and torque_error.can(model):
+        found = torque_error.fit_by_torque(model, data_sets)
+        model = model.with_values(found.values) if found else model
+    return tuple(_followed(model, data_set) for data_set in data_sets)
 
 
 def windows_of(record: Record, found: Followed) -> list[Record]:
