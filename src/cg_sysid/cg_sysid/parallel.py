@@ -179,6 +179,9 @@ def stop() -> None:
         return
     pool, _pool = _pool, None
     processes = list((pool._processes or {}).values())
+    # Work that nobody will take from a full pipe would hold this process when it wants to end.
+    if pool._call_queue is not None:
+        pool._call_queue.cancel_join_thread()
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()

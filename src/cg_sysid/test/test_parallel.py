@@ -105,3 +105,35 @@ def test_a_fit_in_threads_is_the_same_to_the_bit(model_file):
     assert beside.evaluations == alone.evaluations
     np.testing.assert_array_equal(beside.values, alone.values)
     np.testing.assert_array_equal(beside.covariance, alone.covariance)
+
+
+STOPPED_IN_THE_MIDDLE = """
+import time
+
+from cg_sysid.deadline import Deadline, OutOfTime
+from cg_sysid.parallel import run_all
+
+
+def sleep(seconds, ballast):
+    time.sleep(seconds)
+
+
+if __name__ == '__main__':
+    # More than a pipe holds, and more pieces than processes: some of it stays in the pipe.
+    pieces = [(30.0, bytes(4_000_000)) for _ in range(8)]
+    try:
+        with Deadline(2.0).kept():
+            run_all(sleep, pieces, workers=2)
+    except OutOfTime:
+        print('out of time')
+"""
+
+
+def test_work_that_was_dropped_does_not_hold_the_end(tmp_path):
+    script = tmp_path / 'stopped.py'
+    script.write_text(STOPPED_IN_THE_MIDDLE)
+    # Starting two processes takes a second or two each on a busy machine; the pieces 30.
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=25, check=False
+    )
+    assert done.stdout == 'out of time\n', done.stderr
