@@ -1,0 +1,444 @@
+"""How often a diagnosis is right about robots of a URDF that share no code with its models.
+
+    ./cg exec python bench/robots.py                           the whole programme
+    ./cg exec python bench/robots.py --robot arm2              one robot
+    ./cg exec python bench/robots.py --sample 20               a share of all, drawn once
+    ./cg exec python bench/robots.py --case arm2:payload       one of them, in words
+    ./cg exec python bench/robots.py --table-only --write bench/results/robots.md
+
+The robots are MuJoCo's, their laws are in robots_machines.py. What a case does is what somebody
+does who has a robot: the model file is what `cg new-robot` makes of a URDF and of bags with
+positions and efforts on /joint_states; then the bags are checked, cut where they have to be, and
+diagnosed. In that URDF masses, centres and inertias are 5 to 12 % off, friction is 15 % off. A third
+of the machines has small faults: a delay of 1 ms, encoders 0.3 mrad off, dry friction that turns
+twice as fast.
+
+    single     one effect, at one joint, link, sensor, or of all
+    sound      nothing; half of them with small faults
+
+What is right was settled before any was run. single: the first cause is that effect at that place,
+or another that robots_machines.right says is the same in these recordings. sound: no cause. A
+recording that the check refuses, and a case without an answer within --limit, count as wrong.
+
+Every case is one line of --raw, with the version of the sources that made it; a case that is
+there in this version is not run again.
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import os
+import re
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from outside import cpu_seconds, version_of_sources, wilson
+from robots_machines import EFFECTS, ROBOTS, Robot, Secret, record, right, sites, with_small_faults
+from rosbags.typesys import Stores, get_typestore
+
+from cg_description.robot_description import Inertial, parse, with_inertials
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.model import Model
+from cg_interfaces import channels
+from cg_sysid.checks.loading import load_bags
+from cg_sysid.cli.new_robot import template
+from cg_sysid.deadline import Deadline
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.records.bag_file import BagWriter
+from cg_sysid.records.bags import read_bag
+from cg_sysid.records.record import NS_PER_S, Record
+
+SOUND = 4  # machines of each robot with nothing hidden
+PAUSE = 2.0  # s between two recordings
+START = 1_750_000_000 * NS_PER_S
+OFF = 0.05, 0.12  # share by which a mass, a centre, an inertia is off
+FRICTION_OFF = 0.15
+LIMIT = 900.0  # s of one diagnosis on one core
+ROOT = Path(__file__).parents[1]
+STORE = get_typestore(Stores.ROS2_JAZZY)
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+
+
+@dataclass(frozen=True)
+class Case:
+    """One machine.
+
+    Attributes:
+        robot: Name of the robot.
+        effect: What is hidden; `sound` for nothing.
+        number: Among those of the same robot and effect.
+        site: Where, of `robots_machines.sites`.
+        faults: Whether it has small faults.
+    """
+
+    robot: str
+    effect: str
+    number: int
+    site: str
+    faults: bool
+
+    @property
+    def name(self) -> str:
+        """As --case takes it."""
+        return f'{self.robot}:{self.effect}' + (f':{self.number}' if self.number else '')
+
+    @property
+    def seed(self) -> int:
+        """Of everything that is random in it."""
+        return int(hashlib.sha256(self.name.encode()).hexdigest()[:7], 16)
+
+
+def programme() -> list[Case]:
+    """All cases: every effect once for each robot, where it can be seen there."""
+    cases = []
+    for name, robot in ROBOTS.items():
+        rng = np.random.default_rng([2026, list(ROBOTS).index(name)])
+        for k, effect in enumerate(EFFECTS):
+            places = sites(robot, effect)
+            if places:
+                cases.append(Case(name, effect, 0, str(rng.choice(places)), k % 3 == 2))
+        cases += [Case(name, 'sound', k, '', k % 2 == 1) for k in range(SOUND)]
+    return cases
+
+
+def sampled(cases: list[Case], count: int) -> list[Case]:
+    """So many cases, drawn once: a smaller sample is part of a larger."""
+    return [cases[i] for i in np.random.default_rng(3).permutation(len(cases))[:count]]
+
+
+def machine(case: Case) -> tuple[Secret, dict[str, float]]:
+    """What is wrong with it."""
+    robot, random = ROBOTS[case.robot], np.random.default_rng(case.seed)
+    secret, values = Secret(), {}
+    if case.effect != 'sound':
+        secret, values = EFFECTS[case.effect](robot, case.site, random)
+    if case.faults:
+        secret = with_small_faults(robot, secret, random)
+    return secret, {name: float(value) for name, value in values.items()}
+
+
+def known_urdf(case: Case) -> str:
+    """The URDF as its owner has it: numbers are off, and a hidden friction is not stated."""
+    random = np.random.default_rng([case.seed, 7])
+    text = ROBOTS[case.robot].urdf
+
+    def factor(low: float = OFF[0], high: float = OFF[1]) -> float:
+        return float(1 + random.choice([-1, 1]) * random.uniform(low, high))
+
+    off = {}
+    for link, own in parse(text).inertials.items():
+        centre = tuple(x * factor() for x in own.centre)
+        heavier = factor()
+        wider = heavier * factor()
+        off[link] = Inertial(own.mass * heavier, centre, tuple(i * wider for i in own.inertia))
+    text = with_inertials(text, off)
+
+    def friction(found: re.Match) -> str:
+        joint, between, damping, dry = found.groups()
+        values = [float(x) * factor(FRICTION_OFF, FRICTION_OFF) for x in (damping, dry)]
+        hidden = {'viscous_friction': 0, 'coulomb_friction': 1}.get(case.effect)
+        if hidden is not None and joint == case.site:
+            values[hidden] = 0.0
+        return f'<joint name="{joint}"{between}damping="{values[0]}" friction="{values[1]}"'
+
+    pattern = r'<joint name="(\w+)"((?:(?!</joint>).)*?)damping="([^"]*)" friction="([^"]*)"'
+    return re.sub(pattern, friction, text, flags=re.DOTALL)
+
+
+def write_bag(path: Path, robot: Robot, recording, first: int) -> None:
+    """A bag as `ros2 bag record /joint_states` leaves it.
+
+    A joint without a drive has no effort: NaN, as joint_state_broadcaster says it.
+    """
+    types = STORE.types
+    driven = [joint in robot.driven for joint in robot.joints]
+    effort = np.where(driven, recording.effort, np.nan)
+    none = np.array([])
+    with BagWriter(path) as bag:
+        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=STORE)
+        for t, q, tau in zip(recording.time, recording.position, effort, strict=True):
+            stamp = first + round(t * NS_PER_S)
+            at = types['builtin_interfaces/msg/Time'](*divmod(stamp, NS_PER_S))
+            header = types['std_msgs/msg/Header'](stamp=at, frame_id='')
+            state = types[JOINT_STATE](header, list(robot.joints), q, none, tau)
+            bag.write(topic, stamp, STORE.serialize_cdr(state, JOINT_STATE))
+
+
+def in_memory(body: Urdf, robot: Robot, recording, first: int, name: str) -> Record:
+    """The same recording as a record."""
+    return Record(
+        name=name,
+        stamp_ns=first + (recording.time * NS_PER_S).round().astype(np.int64),
+        inputs={f'{j}_effort': recording.effort[:, robot.place(j)] for j in robot.driven},
+        outputs={f'{j}_position': recording.position[:, k] for k, j in enumerate(robot.joints)},
+        mechanism=channels.interface(body),
+    )
+
+
+def same_either_way(a: Record, b: Record) -> bool:
+    """Whether two records hold the same."""
+    pairs = [(a.inputs, b.inputs), (a.outputs, b.outputs)]
+    return np.array_equal(a.stamp_ns, b.stamp_ns) and all(
+        x.keys() == y.keys() and all(np.array_equal(x[n], y[n]) for n in x) for x, y in pairs
+    )
+
+
+def made(case: Case, folder: Path) -> tuple[Path, list[Path], dict[str, float]]:
+    """Model file and bags of a case, and what is hidden.
+
+    Raises:
+        RuntimeError: A bag does not hold what was recorded.
+    """
+    robot = ROBOTS[case.robot]
+    secret, values = machine(case)
+    text = known_urdf(case)
+    body = Urdf(parse(text), robot.driven)
+    bags, records = [], []
+    for k in range(robot.records):
+        recording = record(robot, secret, 100 * case.seed + k)
+        first = START + round(k * (robot.seconds + PAUSE) * NS_PER_S)
+        bags.append(folder / f'moves_{k}')
+        write_bag(bags[-1], robot, recording, first)
+        records.append(read_bag(bags[-1], mechanism=channels.interface(body)))
+        if not same_either_way(records[-1], in_memory(body, robot, recording, first, 'memory')):
+            raise RuntimeError(f'{bags[-1]} does not hold what was recorded')
+    model = folder / 'model.yaml'
+    model.write_text(template(parse(text), robot.driven, records, f'{case.robot}.urdf'))
+    return model, bags, values
+
+
+def labels(case: Case) -> list[str]:
+    """Labels of causes that are right."""
+    robot = ROBOTS[case.robot]
+    body = Urdf(parse(robot.urdf), robot.driven)
+    every = right(robot, case.effect, case.site) if case.effect != 'sound' else ()
+    found = []
+    for name, site in every:
+        kind = LIBRARY[name]
+        found.append(
+            kind(body, site).label if site in kind.sites(body) else f'{name}@{site}'
+        )
+    return found
+
+
+def run(case: Case, version: str, limit: float) -> dict[str, Any]:
+    """One line of the raw results."""
+    robot = ROBOTS[case.robot]
+    about = {
+        'case': case.name, 'robot': case.robot, 'effect': case.effect, 'site': case.site,
+        'faults': case.faults, 'joints': len(robot.joints), 'right': labels(case),
+        'version': version, 'causes': [], 'rivals': [], 'places': [],
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        model, bags, about['values'] = made(case, Path(folder))
+        cpu, wall = cpu_seconds(), time.monotonic()
+        try:
+            about |= answer(model, bags, limit)
+        except Exception:  # whatever a diagnosis dies of is a wrong answer, and not the bench's end
+            about |= {'verdict': 'failed', 'why': traceback.format_exc(limit=-4)}
+    return about | {
+        'cpu_s': round(cpu_seconds() - cpu, 1), 'wall_s': round(time.monotonic() - wall, 1),
+    }  # fmt: skip
+
+
+def answer(model: Path, bags: list[Path], limit: float) -> dict[str, Any]:
+    """What `cg diagnose` would say."""
+    loaded = load_bags(bags, model)
+    warned = sorted({f.code for s in loaded.sources for f in s.check.findings
+                     if f.severity == 'warning'})  # fmt: skip
+    told = {'warnings': warned, 'windows': len(loaded.records)}
+    if loaded.left_out:
+        return told | {
+            'verdict': 'unusable', 'why': '; '.join(f'{s.name}: {s.reason}' for s in loaded.left_out),
+        }  # fmt: skip
+    found = diagnose(
+        Model.load(model), loaded.records, Options(workers=1), landings=loaded.landings,
+        deadline=Deadline(limit),
+    )  # fmt: skip
+    return told | {
+        'verdict': str(found.verdict),
+        'causes': [c.label for c in found.causes],
+        'rivals': [list(c.rivals) for c in found.causes],
+        'places': [list(c.places) for c in found.causes],
+        'parameters': {
+            c.label: {n: v[:2] for n, v in c.parameters.items()} for c in found.causes
+        },
+        'before': found.baseline.held.normalised_error,
+        'after': found.extended.held.normalised_error,
+        'rounds': [
+            {'base': r.base, 'accepted': r.accepted,
+             'first': [[c.label, round(c.evidence, 1), round(c.held.normalised_error, 3), c.reason]
+                       for c in r.candidates[:6]]}
+            for r in found.rounds
+        ],
+        'findings': list(found.findings),
+        'summary': found.summary,
+    }  # fmt: skip
+
+
+def is_right(row: dict[str, Any]) -> bool:
+    """As the head of this file says."""
+    if row['verdict'] in ('failed', 'unfinished', 'unusable'):
+        return False
+    if row['effect'] == 'sound':
+        return not row['causes']
+    return bool(row['causes']) and row['causes'][0] in row['right']
+
+
+def is_among(row: dict[str, Any]) -> bool:
+    """Whether what was hidden is among causes, their rivals and their other places."""
+    named = {*row['causes'], *(x for key in ('rivals', 'places') for xs in row[key] for x in xs)}
+    return bool(named & set(row['right']))
+
+
+def table_of(rows: list[dict[str, Any]]) -> list[str]:
+    """By robot."""
+    lines = [
+        '| robot | joints | hidden | cases | right | 95 % interval | truth among rivals too '
+        '| CPU s: median | 95 % | longest |',
+        '|---|---:|---|---:|---:|---:|---:|---:|---:|---:|',
+    ]
+    groups = [
+        (name, kind, [r for r in rows if r['robot'] == name
+                      and (r['effect'] == 'sound') == (kind == 'nothing')])
+        for name in ROBOTS for kind in ('one effect', 'nothing')
+    ]  # fmt: skip
+    for title, kind, own in [*groups, ('all', 'one effect', _hidden(rows)),
+                             ('all', 'nothing', [r for r in rows if r['effect'] == 'sound'])]:  # fmt: skip
+        if not own:
+            continue
+        correct = sum(map(is_right, own))
+        low, high = wilson(correct, len(own))
+        cpu = [row['cpu_s'] for row in own]
+        among = f'{sum(map(is_among, own))}' if kind != 'nothing' else ''
+        joints = f'{own[0]["joints"]}' if title != 'all' else ''
+        lines.append(
+            f'| {title} | {joints} | {kind} | {len(own)} | {correct} | {low:.0%} to {high:.0%} '
+            f'| {among} | {np.median(cpu):.0f} | {np.quantile(cpu, 0.95):.0f} | {max(cpu):.0f} |'
+        )
+    return lines
+
+
+def _hidden(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row for row in rows if row['effect'] != 'sound']
+
+
+def every_one(rows: list[dict[str, Any]]) -> list[str]:
+    """A line for each case."""
+    lines = [
+        '| case | where | small faults | verdict | causes (rivals) | right | chi2/N before, after '
+        '| CPU s | wall s |',
+        '|---|---|---|---|---|---|---:|---:|---:|',
+    ]
+    for row in rows:
+        causes = '; '.join(
+            f'{cause} ({", ".join([*rivals, *places])})' if rivals or places else cause
+            for cause, rivals, places in zip(
+                row['causes'], row['rivals'], row['places'], strict=True)
+        )  # fmt: skip
+        errors = f'{row["before"]:.4g}, {row["after"]:.4g}' if 'before' in row else ''
+        why = row.get('why', '').strip().splitlines()
+        lines.append(
+            f'| {row["case"]} | {row["site"]} | {"yes" if row["faults"] else ""} '
+            f'| {row["verdict"]} | {causes or (why[-1][:90] if why else "")} '
+            f'| {"yes" if is_right(row) else "**no**"} | {errors} | {row["cpu_s"]:.0f} '
+            f'| {row["wall_s"]:.0f} |'
+        )
+    return lines
+
+
+def version() -> str:
+    """A hash of all sources that an answer depends on."""
+    own = [*Path(__file__).parent.glob('robots_urdf/*.urdf'), Path(__file__).with_name(
+        'robots_machines.py')]  # fmt: skip
+    digest = hashlib.sha256(version_of_sources().encode())
+    for file in sorted(own):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def known_rows(raw: Path, wanted: str | None) -> dict[str, dict[str, Any]]:
+    """Rows by case: of a version, or by default the last of each case."""
+    if not raw.exists():
+        return {}
+    rows = [json.loads(line) for line in raw.read_text().splitlines()]
+    return {row['case']: row for row in rows if wanted in (None, row['version'])}
+
+
+def carried_out(
+    cases: list[Case], version: str, workers: int, limit: float
+) -> Iterator[dict[str, Any]]:
+    """Rows as they come."""
+    with ProcessPoolExecutor(workers, max_tasks_per_child=1) as pool:
+        futures = [pool.submit(run, case, version, limit) for case in cases]
+        for future in as_completed(futures):
+            yield future.result()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--case', help='ROBOT:EFFECT, run and told in words')
+    parser.add_argument('--robot', choices=list(ROBOTS), help='only this one')
+    parser.add_argument('--sample', type=int, help='so many of all cases')
+    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='cases side by side')
+    parser.add_argument('--limit', type=float, default=LIMIT, help=f's a case [{LIMIT:g}]')
+    parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'robots.jsonl')
+    parser.add_argument('--write', type=Path)
+    parser.add_argument('--table-only', action='store_true', help='of the last rows in --raw')
+    options = parser.parse_args()
+    of, cases = version(), programme()
+    if options.case:
+        wanted = [case for case in cases if case.name == options.case]
+        if not wanted:
+            there = ', '.join(case.name for case in cases)
+            print(f'no case {options.case}; there are {there}', file=sys.stderr)
+            return 2
+        row = run(wanted[0], of, options.limit)
+        print(json.dumps(row, indent=1), 'right' if is_right(row) else 'wrong', sep='\n')
+        return 0
+    if options.robot:
+        cases = [case for case in cases if case.robot == options.robot]
+    chosen = sampled(cases, options.sample) if options.sample else cases
+    rows = known_rows(options.raw, None if options.table_only else of)
+    missing = [case for case in chosen if case.name not in rows and not options.table_only]
+    options.raw.parent.mkdir(parents=True, exist_ok=True)
+    for done, row in enumerate(carried_out(missing, of, options.workers, options.limit), 1):
+        rows[row['case']] = row
+        with options.raw.open('a') as raw:
+            raw.write(json.dumps(row) + '\n')
+        print(
+            f'{done}/{len(missing)}', row['case'], row['site'], '->', row['verdict'],
+            *row['causes'], '' if is_right(row) else 'WRONG', row['cpu_s'], flush=True,
+        )  # fmt: skip
+    shown = [rows[case.name] for case in chosen if case.name in rows]
+    if not shown:
+        print('no rows of these sources', file=sys.stderr)
+        return 1
+    lines = [*table_of(shown), '', *every_one(shown)]
+    print('\n'.join(lines))
+    if options.write:
+        versions = ', '.join(dict.fromkeys(row['version'] for row in shown))
+        drawn = f', {len(shown)} of them run' if len(shown) < len(cases) else ''
+        options.write.write_text('\n'.join([
+            '# Robots of a URDF that share no code with the models', '',
+            'Command: `./cg exec python bench/robots.py`; this table of its rows: the same with '
+            f'`--table-only --write FILE`. Sources {versions}.',
+            f'The programme: {len(cases)} cases{drawn}. What is right is written at the head of '
+            'the bench, and was settled before any case was run.', '', *lines, '',
+        ]))  # fmt: skip
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
