@@ -152,15 +152,14 @@ def assemble(model: Model, setup: Setup) -> Equations:
             dz[effect.label] = rates
         return value
 
-    # Torque path: what the drive reports -> motor -> transmission -> joint.
+    # Torque path: what the drive reports, if there is one -> motor -> transmission -> joint.
     torques, starts = [], {}
-    for joint, row, reported in zip(
-        mechanism.joints, mechanism.joints.values(), torque_inputs, strict=True
-    ):
+    driving = dict(zip(mechanism.joints, torque_inputs, strict=True))
+    for joint, row in mechanism.all_joints.items():
         here = [e for e in effects if e.site == joint or e.site == 'all']
         joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
         angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
-        load, share = reported, ca.SX(0)
+        load, share = driving.get(joint, ca.SX(0)), ca.SX(0)
         for hook in ('deliver', 'transmit', 'joint_torque'):
             added = 0
             for e in here:
@@ -214,7 +213,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
             if e.states:
                 lean, rate = full[0][body.stance], full[1][body.stance]
                 starts[e.label] = e.initial_states(lean, rate, ca.SX(0), own[e.label])
-    for row, torque in zip(mechanism.joints.values(), torques, strict=True):
+    for row, torque in zip(mechanism.all_joints.values(), torques, strict=True):
         force += ca.DM(row) * torque
     kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
     mass_matrix, bias = manipulator(kinetic, potential, s, ds)

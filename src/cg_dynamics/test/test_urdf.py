@@ -180,6 +180,23 @@ def test_channels_are_named_after_joints():
         robot(random_tree(8, 3), driven=['wheel'])
 
 
+def test_friction_acts_at_a_joint_without_a_drive_and_what_a_drive_does_acts_at_none():
+    text, random = random_tree(8, 3), np.random.default_rng(2)
+    every, some = robot(text), robot(text, driven=['joint_0'])
+    x, found = random.normal(0, 1, 6), []
+    for model in (every, some):
+        acting = model.with_effect('viscous_friction', 'joint_2', coefficient=0.4)
+        e = assemble(acting, Setup())
+        rates = ca.Function('f', [e.x, e.u, e.p], [e.rates])
+        u = np.zeros(len(model.mechanism.inputs))
+        u[0] = 0.3
+        found.append(np.asarray(rates(x, u, parameter_vector(acting, Setup()))))
+    np.testing.assert_allclose(*found, rtol=1e-12)
+    for name in ('torque_bias', 'rotor_inertia', 'load_dependent_friction', 'back_emf'):
+        with pytest.raises(ModelError, match='not at'):
+            some.with_effect(name, 'joint_2')
+
+
 def test_equal_robots_are_one():
     a, b, other = (Urdf(parse(random_tree(seed, 2))) for seed in (3, 3, 4))
     assert a == b

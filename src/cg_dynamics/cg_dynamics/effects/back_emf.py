@@ -22,6 +22,11 @@ class BackEmf(Effect):
     )  # fmt: skip
     extra_inputs = ('drive_enabled',)
 
+    @classmethod
+    def sites(cls, mechanism):
+        """Joints with a motor."""
+        return tuple(mechanism.joints)
+
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate, while enabled."""
         return -p['coefficient'] * p['drive_enabled'] * rate, []

@@ -181,7 +181,9 @@ class Effect:
     @classmethod
     def sites(cls, mechanism: Mechanism) -> tuple[str, ...]:
         """Where this effect can act in a mechanism, the usual place first; empty if nowhere."""
-        if cls.place in ('command', 'transmission', 'joint'):
+        if cls.place == 'joint':
+            return tuple(mechanism.all_joints)
+        if cls.place in ('command', 'transmission'):
             return tuple(mechanism.joints)
         return ('all',)
 
@@ -197,7 +199,7 @@ class Effect:
 
     def slides(self, mechanism: Mechanism) -> bool:
         """Whether it acts along a line, so that its law is one of lengths and forces."""
-        return self.site in mechanism.joints and mechanism.slides(self.site)
+        return self.site in mechanism.all_joints and mechanism.slides(self.site)
 
     def without_states(self, values: Mapping[str, float]) -> Mapping[str, Mapping[str, float]]:
         """What is left of an effect with states where those may not count.

@@ -27,6 +27,11 @@ class LoadDependentFriction(Effect):
     )  # fmt: skip
     largest_step = 0.002
 
+    @classmethod
+    def sites(cls, mechanism):
+        """Joints with a gear."""
+        return tuple(mechanism.joints)
+
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate."""
         return -p['coefficient'] * ca.fabs(load) * ca.tanh(rate / p['transition_rate']), []

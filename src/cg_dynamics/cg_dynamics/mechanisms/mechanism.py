@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -36,6 +37,8 @@ class Mechanism(ABC):
         coordinates: Names of the full coordinates q.
         joints: Actuated joint -> row B_j with joint angle = B_j q; a torque on the joint is the
             generalised force B_j' tau.
+        passive: Joint without a drive -> its row; friction acts there as well. Only a mechanism
+            that names its joints has any.
         inputs: Input channels, one per actuated joint in the order of `joints`: torques,
             or forces along joints that slide.
         outputs: Output channels, in order.
@@ -56,6 +59,7 @@ class Mechanism(ABC):
     sensor_kinds: Mapping[str, str]
     bodies: tuple[str, ...]
     parameters: tuple[Parameter, ...]
+    passive: Mapping[str, tuple[float, ...]] = MappingProxyType({})
     sliding: tuple[str, ...] = ()
     dimensions: int = 2
 
@@ -68,9 +72,14 @@ class Mechanism(ABC):
         """What a model file has to say of it beyond its name (model_file.ROBOT)."""
         return None
 
+    @property
+    def all_joints(self) -> dict[str, tuple[float, ...]]:
+        """Every joint -> its row, those with a drive first."""
+        return {**self.joints, **self.passive}
+
     def slides(self, joint: str) -> bool:
         """Whether a joint moves along a line: its position is in m, what acts on it in N."""
-        row = self.joints[joint]
+        row = self.all_joints[joint]
         return any(
             share and q in self.sliding for q, share in zip(self.coordinates, row, strict=True)
         )

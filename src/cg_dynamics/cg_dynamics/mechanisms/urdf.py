@@ -58,8 +58,7 @@ class Urdf(Mechanism):
 
     Args:
         description: Links and joints.
-        driven: Names of the joints on which something acts; by default all that move by
-            themselves.
+        driven: Names of the joints that have a drive; by default all that move by themselves.
         rates: Whether rates of joints are measured too.
 
     Raises:
@@ -88,6 +87,7 @@ class Urdf(Mechanism):
         rows = {name: tuple(float(name == other) for other in free) for name in free}
         self.coordinates = tuple(free)
         self.joints = {name: rows[name] for name in self.driven}
+        self.passive = {name: rows[name] for name in free if name not in self.driven}
         self.sliding = tuple(j.name for j in description.independent if j.slides)
         self.inputs = tuple(f'{name}_effort' for name in self.driven)
         units = ['m' if name in self.sliding else 'rad' for name in free]

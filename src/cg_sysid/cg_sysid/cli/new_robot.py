@@ -158,19 +158,18 @@ def _bodies(body: Urdf) -> Iterator[str]:
 
 
 def _effects(body: Urdf, description: RobotDescription) -> Iterator[str]:
-    several = len(body.driven) > 1
     stated = [
         (joint, name, parameter, getattr(joint, attribute))
         for joint in description.independent
         for name, (parameter, attribute) in FRICTION.items()
-        if joint.name in body.joints and getattr(joint, attribute)
+        if getattr(joint, attribute)
     ]
     if stated:
         yield 'effects:'
     for joint, name, parameter, value in stated:
         unit = LIBRARY[name](body, joint.name).parameters[0].unit
         yield f'- name: {name}   # {shortened(LIBRARY[name].summary, name)}'
-        if several:
+        if len(body.coordinates) > 1:
             yield f'  at: {joint.name}'
         q = Quantity(value, unit, 0.5 * value, source='dynamics in the URDF')
         yield f'  parameters: {{{parameter}: {flow(q)}}}'
