@@ -2,6 +2,7 @@
 
     ./cg exec python bench/robots.py                           the whole programme
     ./cg exec python bench/robots.py --robot arm2              one robot
+    ./cg exec python bench/robots.py 'arm2:*friction' '*:sound*' those that fit, in this order
     ./cg exec python bench/robots.py --sample 20               a share of all, drawn once
     ./cg exec python bench/robots.py --case arm2:payload       one of them, in words
     ./cg exec python bench/robots.py --table-only --write bench/results/robots.md
@@ -37,6 +38,7 @@ import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -388,6 +390,7 @@ def carried_out(
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('patterns', nargs='*', help="names of cases, such as '*:payload'")
     parser.add_argument('--case', help='ROBOT:EFFECT, run and told in words')
     parser.add_argument('--robot', choices=list(ROBOTS), help='only this one')
     parser.add_argument('--sample', type=int, help='so many of all cases')
@@ -407,6 +410,10 @@ def main() -> int:
         row = run(wanted[0], of, options.limit)
         print(json.dumps(row, indent=1), 'right' if is_right(row) else 'wrong', sep='\n')
         return 0
+    if options.patterns:
+        cases = list(dict.fromkeys(
+            case for pattern in options.patterns for case in cases if fnmatch(case.name, pattern)
+        ))  # fmt: skip
     if options.robot:
         cases = [case for case in cases if case.robot == options.robot]
     chosen = sampled(cases, options.sample) if options.sample else cases
