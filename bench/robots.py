@@ -10,9 +10,9 @@
 The robots are MuJoCo's, their laws are in robots_machines.py. What a case does is what somebody
 does who has a robot: the model file is what `cg new-robot` makes of a URDF and of bags with
 positions and efforts on /joint_states; then the bags are checked, cut where they have to be, and
-diagnosed. In that URDF masses, centres and inertias are 5 to 12 % off, friction is 15 % off. A third
-of the machines has small faults: a delay of 1 ms, encoders 0.3 mrad off, dry friction that turns
-twice as fast.
+diagnosed. In that URDF masses, centres and inertias are 5 to 12 % off, friction is 15 % off. A
+third of the machines has small faults: a delay of 1 ms, encoders 0.3 mrad off, dry friction that
+turns twice as fast.
 
     single     one effect, at one joint, link, sensor, or of all
     sound      nothing; half of them with small faults
@@ -28,7 +28,6 @@ there in this version is not run again.
 import argparse
 import hashlib
 import json
-import math
 import os
 import re
 import sys
@@ -228,9 +227,7 @@ def labels(case: Case) -> list[str]:
     found = []
     for name, site in every:
         kind = LIBRARY[name]
-        found.append(
-            kind(body, site).label if site in kind.sites(body) else f'{name}@{site}'
-        )
+        found.append(kind(body, site).label if site in kind.sites(body) else f'{name}@{site}')
     return found
 
 
@@ -247,7 +244,7 @@ def run(case: Case, version: str, limit: float) -> dict[str, Any]:
         cpu, wall = cpu_seconds(), time.monotonic()
         try:
             about |= answer(model, bags, limit)
-        except Exception:  # whatever a diagnosis dies of is a wrong answer, and not the bench's end
+        except Exception:  # what a diagnosis dies of is a wrong answer, not the bench's end
             about |= {'verdict': 'failed', 'why': traceback.format_exc(limit=-4)}
     return about | {
         'cpu_s': round(cpu_seconds() - cpu, 1), 'wall_s': round(time.monotonic() - wall, 1),
@@ -262,7 +259,8 @@ def answer(model: Path, bags: list[Path], limit: float) -> dict[str, Any]:
     told = {'warnings': warned, 'windows': len(loaded.records)}
     if loaded.left_out:
         return told | {
-            'verdict': 'unusable', 'why': '; '.join(f'{s.name}: {s.reason}' for s in loaded.left_out),
+            'verdict': 'unusable',
+            'why': '; '.join(f'{s.name}: {s.reason}' for s in loaded.left_out),
         }  # fmt: skip
     found = diagnose(
         Model.load(model), loaded.records, Options(workers=1), landings=loaded.landings,
@@ -311,13 +309,10 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
         '| CPU s: median | 95 % | longest |',
         '|---|---:|---|---:|---:|---:|---:|---:|---:|---:|',
     ]
-    groups = [
-        (name, kind, [r for r in rows if r['robot'] == name
-                      and (r['effect'] == 'sound') == (kind == 'nothing')])
-        for name in ROBOTS for kind in ('one effect', 'nothing')
-    ]  # fmt: skip
-    for title, kind, own in [*groups, ('all', 'one effect', _hidden(rows)),
-                             ('all', 'nothing', [r for r in rows if r['effect'] == 'sound'])]:  # fmt: skip
+    groups = [(title, kind) for title in (*ROBOTS, 'all') for kind in ('one effect', 'nothing')]
+    for title, kind in groups:
+        own = [row for row in rows if title in (row['robot'], 'all')
+               and (row['effect'] == 'sound') == (kind == 'nothing')]  # fmt: skip
         if not own:
             continue
         correct = sum(map(is_right, own))
@@ -330,10 +325,6 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
             f'| {among} | {np.median(cpu):.0f} | {np.quantile(cpu, 0.95):.0f} | {max(cpu):.0f} |'
         )
     return lines
-
-
-def _hidden(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [row for row in rows if row['effect'] != 'sound']
 
 
 def every_one(rows: list[dict[str, Any]]) -> list[str]:

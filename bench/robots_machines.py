@@ -389,7 +389,8 @@ def stribeck(robot, joint, random):
 def payload(robot, link, random):
     mass = float(random.uniform(0.5, 0.9)) * CARRIED[robot.name]
     place = tuple(x + random.uniform(-0.02, 0.02) for x in TIPS[robot.name])
-    return Secret(payload=(link, mass, place)), {'mass': mass, **dict(zip('xyz', place))}
+    values = {'mass': mass, **dict(zip('xyz', place, strict=True))}
+    return Secret(payload=(link, mass, place)), values
 
 
 def rotor(robot, joint, random):
