@@ -56,6 +56,7 @@ ROS = {
     'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
     'std_msgs', 'std_srvs', 'trajectory_msgs', 'visualization_msgs',
 }  # fmt: skip
+ROS_HELPERS = {'ros', 'drive_publishers', 'sensor_publishers'}
 
 
 def imports(path):
@@ -118,7 +119,7 @@ def test_manifest_names_the_packages_that_are_imported(package):
 @pytest.mark.parametrize('package', [name for name in MAY_IMPORT if name != 'cg_bringup'])
 def test_only_nodes_and_the_ros_helpers_import_ros(package):
     for path in modules(package):
-        if not path.stem.endswith('_node') and path.stem not in {'ros', 'sensor_publishers'}:
+        if not path.stem.endswith('_node') and path.stem not in ROS_HELPERS:
             assert not imports(path) & ROS, path.relative_to(SRC)
 
 

@@ -9,6 +9,7 @@ bounces and slides (contact.py).
 
 import bisect
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -123,6 +124,23 @@ class Plant:
     def state(self) -> np.ndarray:
         """The true state now, shape (nx,)."""
         return self._x.copy()
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """What the state holds, in order."""
+        return self._compiled.state_names
+
+    def place(self, angles: Mapping[str, float]) -> None:
+        """Put the body somewhere, at rest there.
+
+        Args:
+            angles: Free coordinate, such as `q_outer`, -> its angle in rad; the others stay.
+        """
+        motion = np.zeros(2 * self._compiled.equations.coordinates)
+        for k, name in enumerate(self.state_names[: len(motion) // 2]):
+            motion[k] = angles.get(name, self._x[k])
+        self._x = self._compiled.initial_state(motion, self._applied, self._p)
+        self._past[-1] = (self._past[-1][0], self._x.copy())
 
     def latch(self, torque: np.ndarray) -> None:
         """Give the drive a new set-point in N m, shape (nu,); it holds until the next."""

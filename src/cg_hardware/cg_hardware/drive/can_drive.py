@@ -1,14 +1,18 @@
-"""A drive on a CAN bus: set up by SDO, led by PDO, watched by heartbeat. No ROS.
+"""A drive on a CAN bus: set up by SDO, led by PDO, watched by heartbeat or guarding. No ROS.
 
 Every cycle the host sends the controlword and the torque, then SYNC; the drive lets the torque act
 at that SYNC, and answers with statusword, position and torque of the same instant. Three watches
-look at each other: the drive at the host's heartbeat and at the torque's PDO, the host at the
+look at each other: the drive at the host (watch.py) and at the torque's PDO, the host at the
 drive's answers. Whichever is silent, the torque is zero: in the drive, because it faults; here,
 because the drive then is not enabled, and is enabled again only by `enable`.
 
     RPDO 1  0x200 + node   controlword (uint16), target torque (int16, per mille of rated)
+    RPDO 2  0x300 + node   digital outputs (uint32), when they change, and every 25 cycles
     TPDO 1  0x180 + node   statusword (uint16), position (int32, counts), torque (int16)
     TPDO 2  0x280 + node   digital inputs (uint32), when they change, and every 50 ms
+
+A drive without outputs that are wanted gets no RPDO 2. Instead of torque it may be led through a
+procedure (procedure.py) that finds where its zero is.
 """
 
 import contextlib
@@ -21,28 +25,24 @@ from dataclasses import dataclass
 
 import can
 import canopen
-from canopen.sdo.exceptions import SdoError
 
 from cg_hardware.drive import cia402
 from cg_hardware.drive.cia402 import State
+from cg_hardware.drive.feet import REPEATED
+from cg_hardware.drive.objects import DriveError, Objects
+from cg_hardware.drive.procedure import Procedure, Seen
+from cg_hardware.drive.watch import PATIENCE_MS, WATCHES
 
-HOST = 0x7F  # node number of the host's heartbeat
-SYNC, HEARTBEAT = 0x080, 0x700
+SYNC = 0x080
 COMMAND = struct.Struct('<Hh')
 ANSWER = struct.Struct('<Hih')
 OFF = 1 << 31  # bit of a COB-ID: the object is off
-AT_SYNC, AT_CHANGE = 1, 255  # when a PDO is sent
+AT_SYNC, AT_CHANGE = 1, 255  # when a PDO is sent, or acts
 INPUTS_MS = 50  # in which the inputs come again, changed or not
 PRESENT = 402  # low half of the device type
 LATEST_NS = 2_800_000  # ns that an answer takes at most; an older SYNC's is lost
 SILENCE_S = 0.015  # s without an answer after which the drive counts as lost
-PATIENCE_MS = 18  # for which the drive waits for the host's heartbeat and torque: 20 less a cycle
-OPERATIONAL = 0x05
 FAULTS = (State.REACTING, State.FAULT)
-
-
-class DriveError(Exception):
-    """A drive that is not there, refuses its set-up, or reports a fault."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Answer:
         counts: Position.
         torque: In N m at the joint, as the drive reports it.
         inputs: Digital inputs, as they last came.
+        status: The whole statusword.
     """
 
     sync_ns: int
@@ -62,6 +63,7 @@ class Answer:
     counts: int
     torque: float
     inputs: int
+    status: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,11 @@ class Scale:
 
     rated: float
     sign: float = 1.0
+
+    @property
+    def per_mille(self) -> float:
+        """What the drive calls a torque of 1 N m, but for the sign."""
+        return cia402.PER_MILLE / self.rated
 
     def target(self, torque: float) -> int:
         """Per mille of rated torque for a torque in N m, as far as 16 bits go."""
@@ -94,11 +101,17 @@ class CanDrive:
         node: Number of the drive on it.
         sign: Of its torque, `Scale`.
         gear: Torque at the joint per torque of the motor, where the rated one is the motor's.
+        watch: How the drive sees that the host is there, one of WATCHES.
+        output_mask: Digital outputs that the host sets.
         wall_ns: Clock of the answers.
 
     Attributes:
+        objects: Its object dictionary.
+        scale: Of its torque.
         answers: What the drive said since they were last taken, oldest first.
-        wanted: Whether it is led to operation enabled.
+        wanted: Whether it is led to operation enabled, for torque.
+        procedure: What it is led through instead.
+        outputs: Digital outputs that are wanted now.
         reason: Why it is not enabled, in words; empty while nothing is wrong.
 
     Raises:
@@ -111,9 +124,14 @@ class CanDrive:
         node: int,
         sign: float = 1.0,
         gear: float = 1.0,
+        watch: str = 'heartbeat',
+        output_mask: int = 0,
         wall_ns: Callable[[], int] = time.time_ns,
     ):
         self.node, self._wall_ns = node, wall_ns
+        self.procedure: Procedure | None = None
+        self.outputs, self._mask = 0, output_mask
+        self._outputs_sent, self._cycles = 0, 0
         self.answers: deque[Answer] = deque(maxlen=1000)
         self.wanted, self.reason = False, ''
         self._lock = threading.Lock()
@@ -125,9 +143,11 @@ class CanDrive:
         self._inputs = 0
         self._reset = False
         self._open(bus)
+        self.objects = Objects(self._remote)
+        self._watches = WATCHES[watch](self._network, node)
         try:
             rated = self._set_up() * gear
-        except (SdoError, can.CanError, OSError) as error:
+        except (DriveError, can.CanError, OSError) as error:
             self.close()
             raise DriveError(f'drive {node} on {told(bus)}: {error}') from error
         self.scale = Scale(rated, sign)
@@ -142,32 +162,36 @@ class CanDrive:
             raise DriveError(f'{told(bus)}: {error}') from error
         self._remote = canopen.RemoteNode(self.node, canopen.ObjectDictionary())
         self._network.add_node(self._remote)
-        self._remote.sdo.RESPONSE_TIMEOUT = 0.3
         self._network.subscribe(0x180 + self.node, self._on_answer)
         self._network.subscribe(0x280 + self.node, self._on_inputs)
         self._remote.emcy.add_callback(self._on_emergency)
 
     def _set_up(self) -> float:
         """Tell the drive what to send, what to expect, and how to drive; its rated torque, N m."""
-        sdo = self._remote.sdo
-        kind = int.from_bytes(sdo.upload(0x1000, 0), 'little')
+        write = self.objects.write
+        kind = self.objects.read(0x1000)
         if kind & 0xFFFF != PRESENT:
-            raise OSError(f'is no CiA 402 drive: its device type is 0x{kind:08x}')
+            raise DriveError(f'is no CiA 402 drive: its device type is 0x{kind:08x}')
         self._remote.nmt.send_command(0x80)  # pre-operational: mappings may change
-        self._write(0x1016, 1, HOST << 16 | PATIENCE_MS, 4)
-        self._write(cia402.ABORT_CONNECTION, 0, 1, 2)
+        self._watches.set_up(self.objects)
+        write(cia402.ABORT_CONNECTION, 0, 1, 2)
         self._map(0x1400, 0x1600, 0x200 + self.node,
                   (cia402.CONTROLWORD << 16 | 16, cia402.TARGET_TORQUE << 16 | 16))  # fmt: skip
-        self._write(0x1400, 5, PATIENCE_MS, 2)
+        write(0x1400, 5, PATIENCE_MS, 2)
+        if self._mask:
+            write(cia402.OUTPUTS, 1, 0, 4)
+            write(cia402.OUTPUTS, 2, self._mask, 4)
+            output = cia402.OUTPUTS << 16 | 1 << 8 | 32
+            self._map(0x1401, 0x1601, 0x300 + self.node, (output,), AT_CHANGE)
         self._map(0x1800, 0x1A00, 0x180 + self.node,
                   (cia402.STATUSWORD << 16 | 16, cia402.POSITION << 16 | 32,
                    cia402.ACTUAL_TORQUE << 16 | 16))  # fmt: skip
         self._map(0x1801, 0x1A01, 0x280 + self.node, (cia402.INPUTS << 16 | 32,), AT_CHANGE)
-        self._write(0x1801, 5, INPUTS_MS, 2)
-        self._write(cia402.MODE, 0, cia402.CYCLIC_TORQUE, 1)
-        rated = int.from_bytes(sdo.upload(cia402.RATED_TORQUE, 0), 'little')
+        write(0x1801, 5, INPUTS_MS, 2)
+        write(cia402.MODE, 0, cia402.CYCLIC_TORQUE, 1)
+        rated = self.objects.read(cia402.RATED_TORQUE)
         if rated == 0:
-            raise OSError('its rated torque (0x6076) is zero')
+            raise DriveError('its rated torque (0x6076) is zero')
         self._remote.nmt.send_command(0x01)
         return rated / 1000
 
@@ -175,16 +199,14 @@ class CanDrive:
         self, about: int, mapping: int, cob: int, objects: tuple[int, ...], when: int = AT_SYNC
     ) -> None:
         """Have a PDO hold these objects."""
-        self._write(about, 1, cob | OFF, 4)
-        self._write(about, 2, when, 1)
-        self._write(mapping, 0, 0, 1)
+        write = self.objects.write
+        write(about, 1, cob | OFF, 4)
+        write(about, 2, when, 1)
+        write(mapping, 0, 0, 1)
         for k, entry in enumerate(objects, 1):
-            self._write(mapping, k, entry, 4)
-        self._write(mapping, 0, len(objects), 1)
-        self._write(about, 1, cob, 4)
-
-    def _write(self, index: int, sub: int, value: int, size: int) -> None:
-        self._remote.sdo.download(index, sub, value.to_bytes(size, 'little'))
+            write(mapping, k, entry, 4)
+        write(mapping, 0, len(objects), 1)
+        write(about, 1, cob, 4)
 
     # What comes in, in the thread of the bus
 
@@ -200,7 +222,8 @@ class CanDrive:
             sync_ns = self._answered_sync()
             if sync_ns is None:
                 return
-            answer = Answer(sync_ns, state, counts, self.scale.torque(torque), self._inputs)
+            held = self.scale.torque(torque)
+            answer = Answer(sync_ns, state, counts, held, self._inputs, word)
             self.answers.append(answer)
             self._last, self._answered = answer, time.monotonic()
         self._heard.set()
@@ -244,14 +267,20 @@ class CanDrive:
         self.wanted, self.reason, self._reset = True, '', True
         self._enabling_since = time.monotonic()
 
+    def lead_through(self, procedure: Procedure) -> None:
+        """Go through a procedure; until it is over there is no torque by `cycle`."""
+        self.wanted, self.procedure = False, procedure
+
     def disable(self, reason: str) -> None:
-        """Take the torque off, until `enable`."""
+        """Take the torque off, until `enable`, and end a procedure."""
+        if self.procedure is not None:
+            self.procedure.cancel(reason)
         if self.wanted or not self.reason:
             self.reason = reason
         self.wanted = False
 
     def cycle(self, torque: float) -> None:
-        """One cycle: command, SYNC, heartbeat.
+        """One cycle: command, SYNC, a sign of life, outputs.
 
         Args:
             torque: At the joint in N m; only while `enabled` it goes out.
@@ -260,7 +289,7 @@ class CanDrive:
             DriveError: The bus is gone.
         """
         state = self.state
-        self._watch(state)
+        self._look(state)
         target = self.scale.target(torque) if self.wanted and state == State.ENABLED else 0
         self._heard.clear()
         try:
@@ -268,16 +297,27 @@ class CanDrive:
             with self._lock:
                 self._asked.append(self._wall_ns())
             self._network.send_message(SYNC, b'')
-            self._network.send_message(HEARTBEAT + HOST, bytes([OPERATIONAL]))
+            self._watches.cycle()
+            self._send_outputs()
         except (can.CanError, OSError) as error:
             self.disable(f'the bus is gone: {error}')
             raise DriveError(f'drive {self.node}: {error}') from error
+
+    def _send_outputs(self) -> None:
+        self._cycles += 1
+        changed = self.outputs != self._outputs_sent
+        if self._mask and (changed or self._cycles % REPEATED == 0):
+            word = (self.outputs & self._mask).to_bytes(4, 'little')
+            self._network.send_message(0x300 + self.node, word)
+            self._outputs_sent = self.outputs
 
     def await_answer(self, timeout_s: float) -> None:
         """Wait until the drive has answered the last SYNC, or so long."""
         self._heard.wait(timeout_s)
 
     def _word(self, state: State | None) -> int:
+        if self.procedure is not None:
+            return self.procedure.word(self._seen(state), self._emergency)
         if not self.wanted or state is None:
             return cia402.DISABLE_VOLTAGE
         if state == State.ENABLED:
@@ -287,11 +327,18 @@ class CanDrive:
             return cia402.FAULT_RESET
         return cia402.word_to_enable(state)
 
-    def _watch(self, state: State | None) -> None:
+    def _seen(self, state: State | None) -> Seen:
+        with self._lock:
+            last = self._last
+        return Seen(state, last.status, last.counts) if last else Seen(state, 0, 0)
+
+    def _look(self, state: State | None) -> None:
         """Give up what is no longer as it should be."""
         if not self.wanted:
             return
-        if state is None and time.monotonic() - self._enabling_since > SILENCE_S:
+        if problem := self._watches.problem:
+            self.disable(problem)
+        elif state is None and time.monotonic() - self._enabling_since > SILENCE_S:
             self.disable('the drive is silent')
         elif state in FAULTS and not self._reset and self._past_start:
             with self._lock:
@@ -308,9 +355,12 @@ class CanDrive:
         """Leave the drive without torque, and the bus; once more does nothing."""
         # Where the bus is gone the drive's own watch sees to it.
         gone = contextlib.suppress(can.CanError, OSError, RuntimeError)
+        self.objects.close()
         with gone:
             self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
             self._network.send_message(SYNC, b'')
+            if self._mask:
+                self._network.send_message(0x300 + self.node, bytes(4))
         with gone:
             self._network.disconnect()
 

@@ -11,12 +11,26 @@ from one to the next by the controlword:
 from enum import Enum
 
 CONTROLWORD, STATUSWORD = 0x6040, 0x6041
-MODE, CYCLIC_TORQUE = 0x6060, 10
+MODE, MODE_NOW = 0x6060, 0x6061  # int8
+CYCLIC_TORQUE, HOMING = 10, 6
 TARGET_TORQUE, ACTUAL_TORQUE = 0x6071, 0x6077  # int16, per mille of the rated torque
 RATED_TORQUE = 0x6076  # uint32, mN m
+MAX_TORQUE = 0x6072  # uint16, per mille of the rated torque, in every mode
 POSITION = 0x6064  # int32, counts
 INPUTS = 0x60FD  # uint32, digital; the upper half is free for what is wired to them
+OUTPUTS = 0x60FE  # uint32, digital: 1 what is wanted, 2 which of it the host may set
+DC_LINK = 0x6079  # uint32, mV
 ABORT_CONNECTION = 0x6007  # what the drive does when the wire is silent; 1 is a fault
+# Homing: method, speeds (1 to the switch, 2 to the index), acceleration, where zero is from home.
+HOMING_METHOD, HOMING_SPEEDS, HOMING_ACCELERATION, HOME_OFFSET = 0x6098, 0x6099, 0x609A, 0x607C
+START_HOMING = 1 << 4  # of the controlword
+HOMING_REACHED, HOMING_ATTAINED, HOMING_ERROR = 1 << 10, 1 << 12, 1 << 13  # of the statusword
+TO_INDEX = (33, 34)  # homing methods: to the index, in negative and in positive direction
+IN_PLACE = (35, 37)  # home is where the shaft stands
+# Touch probe 1: what latches, what was latched, where that was at the rising edge.
+PROBE, PROBE_STATUS, PROBE_POSITION = 0x60B8, 0x60B9, 0x60BA
+PROBE_AT_INDEX = 1 << 0 | 1 << 2 | 1 << 4  # on, by the encoder's index, at its rising edge
+PROBE_LATCHED = 1 << 1
 PER_MILLE = 1000
 LARGEST_TARGET = 32767
 

@@ -10,13 +10,14 @@ Faults are asked for on standard input, one a line, with a number where one is n
 
     imu_silent  imu_back  imu_frozen  imu_garbage N  imu_cut N  imu_unplug  imu_plug
     can_silent  can_back  can_garbage N  can_unplug  can_plug
-    drive_fault CODE  drive_off  drive_on
+    drive_fault CODE  drive_off  drive_on  drive_volts V  drive_degc T  drive_lacks INDEX
     usb_ms T (the IMU's bytes go out every T ms)  can_jitter_ms T  push P (N s at the hip)
-    let_go  hold  report
+    let_go  hold  turn A (a person opens the hip by A rad more, while the robot is held)  report
 
 `report` prints one line of JSON: the time, the state of the drive, its torque and every change of
-it since the last report, the lean of the stance leg, how far it went, and how long the host held
-the emulation up since the last report (`late`, s): what was measured meanwhile says little.
+it since the last report, its outputs, the lean of the stance leg, how far it went, the hip angle,
+and how long the host held the emulation up since the last report (`late`, s): what was measured
+meanwhile says little.
 """
 
 import argparse
@@ -50,6 +51,8 @@ BEHIND = 0.5  # s that the emulation may be late before it lets time go
 DRIFT = 40e-6  # of the IMU's quartz
 WRAPS_SOON = 4_294_000_000  # ticks: the counter begins anew within the first half minute
 SHELL = 12_345  # counts at which the encoder wakes up
+INDEX = 0.06  # rad of the hip at which the encoder has its index
+BY_HAND = 0.3  # rad/s at which a person turns the hip
 FOOT_BITS = {'inner': 1 << 16, 'outer': 1 << 17}  # of the drive's inputs, a foot switch each
 GIMBAL = (0.012, -0.7)  # rad: roll and yaw of an IMU that is mounted as people mount things
 
@@ -77,8 +80,10 @@ class EmulatedRobot:
         self.can_line: Pty | None = Pty(folder / 'can')
         self._can = SerialCan(self.can_line)
         self.imu = Gx3Device(drift=DRIFT, timer=WRAPS_SOON)
-        self.drive = Cia402Device()
+        self._index = SHELL + round(INDEX / self._count)
+        self.drive = self._new_drive()
         self._greeted = False
+        self._to_turn = 0.0
         self._hip, self._hip_rate = self._plant.measure().outputs['hip_angle'], 0.0
         self._held = True
         self._silent: set[str] = set()
@@ -89,6 +94,10 @@ class EmulatedRobot:
         self._told = 0
         self.farthest = self.late = 0.0
         self.ticks = 0
+
+    def _new_drive(self) -> Cia402Device:
+        turn = round(2 * math.pi / self._count)
+        return Cia402Device(counts=self._index, index=self._index, turn=turn)
 
     @property
     def now(self) -> float:
@@ -113,6 +122,11 @@ class EmulatedRobot:
             except SimulationError:
                 self._held = True  # it lies on the floor
             self.farthest = max(self.farthest, abs(self.lean))
+        elif self._to_turn:
+            step = math.copysign(min(BY_HAND * STEP, abs(self._to_turn)), self._to_turn)
+            self._to_turn -= step
+            outer = self._plant.state_names.index('q_outer')
+            self._plant.place({'q_outer': float(self._plant.state[outer]) - step})
         self.ticks += 1
         measured = self._plant.measure()
         outputs = measured.outputs
@@ -203,8 +217,16 @@ class EmulatedRobot:
             self.drive.log.append((self.now, 0))
             self.drive.acting = 0
         elif word == 'drive_on':
-            self.drive = Cia402Device()
+            self.drive = self._new_drive()
             self._greeted = False
+        elif word == 'drive_volts':
+            self.drive.voltage = round(1000 * number)
+        elif word == 'drive_degc':
+            self.drive.temperature = round(10 * number)
+        elif word == 'drive_lacks':
+            self.drive.missing = frozenset((int(number), sub) for sub in range(9))
+        elif word == 'turn':
+            self._to_turn += number
         elif word == 'usb_ms':
             self._usb_s = number / 1000
         elif word == 'can_jitter_ms':
@@ -222,8 +244,8 @@ class EmulatedRobot:
         late, self.late = self.late, 0.0
         return json.dumps({
             'time': self.now, 'state': self.drive.state, 'acting': self.drive.acting,
-            'changes': changes, 'lean': self.lean, 'farthest': self.farthest,
-            'held': self._held, 'late': late,
+            'changes': changes, 'outputs': self.drive.outputs, 'lean': self.lean,
+            'farthest': self.farthest, 'hip': self._hip, 'held': self._held, 'late': late,
         })  # fmt: skip
 
 

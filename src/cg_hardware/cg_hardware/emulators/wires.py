@@ -7,6 +7,7 @@ import tty
 from pathlib import Path
 
 FRAME = re.compile(rb't([0-9A-Fa-f]{3})([0-8])((?:[0-9A-Fa-f]{2})*)\Z')
+REMOTE = re.compile(rb'r([0-9A-Fa-f]{3})[0-8]\Z')
 LINE_LIMIT = 64  # bytes of a line; what is longer is garbage
 
 
@@ -55,19 +56,19 @@ class Pty:
 class SerialCan:
     """CAN frames on a serial line, in the ASCII of Lawicel's adapters (SLCAN).
 
-    tIIIL DD.. CR is a frame with an 11-bit identifier; S, O, C open and close, and are answered
-    by CR.
+    tIIIL DD.. CR is a frame with an 11-bit identifier, rIIIL CR a remote request for one; S, O, C
+    open and close, and are answered by CR.
     """
 
     def __init__(self, line: Pty):
         self._line, self._buffer = line, b''
         self.opened = False
 
-    def receive(self) -> list[tuple[int, bytes]]:
-        """Frames that came in: identifier, data."""
+    def receive(self) -> list[tuple[int, bytes | None]]:
+        """Frames that came in: identifier, data, or None of a remote request."""
         *lines, self._buffer = (self._buffer + self._line.read()).split(b'\r')
         self._buffer = self._buffer[-LINE_LIMIT:]
-        frames = []
+        frames: list[tuple[int, bytes | None]] = []
         for line in lines:
             if line[:1] in (b'O', b'C', b'S'):
                 self.opened = line[:1] == b'O' if line[:1] != b'S' else self.opened
@@ -76,6 +77,8 @@ class SerialCan:
                 data = bytes.fromhex(match[3].decode())
                 if len(data) == int(match[2]):
                     frames.append((int(match[1], 16), data))
+            elif match := REMOTE.match(line):
+                frames.append((int(match[1], 16), None))
         return frames
 
     def send(self, frames: list[tuple[int, bytes]]) -> None:
