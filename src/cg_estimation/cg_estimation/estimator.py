@@ -10,7 +10,10 @@ here, by their stamps alone:
 
 - a repeated stamp changes nothing; one older than the last is counted and ignored;
 - a channel that is absent or not finite corrects nothing, the model goes on without it;
-- a gap is predicted across; after a longer one than `longest_gap` the estimate starts anew;
+- a gap is predicted across; after a longer one than `longest_gap`, of all channels or of one of the
+  angles, the estimate starts anew;
+- an angle that jumps further than any motion does is left out; if the readings after it agree with
+  it, its zero has moved (somebody took a new one), and the estimate starts anew;
 - a new stance leg means that the swing foot has landed: the impact map (Eq. 4.11) acts on the
   estimate, then the equations are those of the other stance.
 """
@@ -32,6 +35,10 @@ from cg_dynamics.walking.impact import impact
 
 NANOSECONDS = 1_000_000_000
 RUNAWAY = 1e3  # rad, rad/s: no estimate of this robot is there
+ANGLES = ('imu_angle', 'hip_angle')
+FASTEST = 20.0  # rad/s: no angle of this robot changes faster
+NOISE = 0.01  # rad by which a reading may be off besides
+AGREED = 3  # readings in a row that make a jump a new zero
 
 Outputs = Mapping[str, float]
 
@@ -144,6 +151,8 @@ class StampedEstimator(ABC):
         if gap <= 0.0:
             self.ignored += gap < 0.0
             return last
+        if not self._believes(stamp_ns, y):
+            return self._start(stamp_ns, torque, y, stance)
         self._predict(gap, torque)
         if stance != self.stance:
             self._land(stance)
@@ -151,6 +160,26 @@ class StampedEstimator(ABC):
         if not (np.abs(self._x[:4]) < RUNAWAY).all():
             return self._start(stamp_ns, torque, y, stance)
         return self._conclude(stamp_ns, y, last.running + gap)
+
+    def _believes(self, stamp_ns: int, y: np.ndarray) -> bool:
+        """Leave out angles that jump; False if one has a new zero, or was away for too long."""
+        now = (stamp_ns - self._start_ns) / NANOSECONDS
+        for k, channel in enumerate(self.channels):
+            if channel not in ANGLES or math.isnan(y[k]):
+                continue
+            if now - self._seen[channel] > self.longest_gap:
+                return False
+            jumps = self._jumps[channel]
+            if _follows(y[k], now, *self._believed[channel]):
+                jumps.clear()
+                continue
+            if jumps and not _follows(y[k], now, *jumps[-1]):
+                jumps.clear()
+            jumps.append((float(y[k]), now))
+            if len(jumps) >= AGREED:
+                return False
+            y[k] = math.nan
+        return True
 
     def _start(self, stamp_ns: int, torque: float, y: np.ndarray, stance: str) -> Estimate:
         """At the measured pose; of the rates only the one that the gyro tells is known."""
@@ -161,6 +190,9 @@ class StampedEstimator(ABC):
         rate = reading.get('imu_rate', 0.0)
         self._start_ns = stamp_ns
         self._seen = dict.fromkeys(self.channels, -math.inf)
+        # Angle -> its last reading and when that was, s; readings that jumped since.
+        self._believed: dict[str, tuple[float, float]] = {}
+        self._jumps: dict[str, list[tuple[float, float]]] = {c: [] for c in ANGLES}
         # A stance leg that does not turn, a swing leg that goes with it.
         outer = rate if stance == 'inner' else 0.0
         self._begin(np.array([lean, lean - hip, rate, outer]), torque)
@@ -171,6 +203,7 @@ class StampedEstimator(ABC):
         for channel, value in zip(self.channels, y, strict=True):
             if not math.isnan(value):
                 self._seen[channel] = now
+                self._believed[channel] = float(value), now
         blind = max(now - self._seen['imu_angle'], now - self._seen['hip_angle'])
         self._estimate = Estimate(stamp_ns, self.stance, self._x.copy(), running, blind)
         return self._estimate
@@ -203,6 +236,11 @@ class StampedEstimator(ABC):
         """The swing foot has landed and is stance now."""
         self._x[:4] = impact(self.model, self.stance, self._x).x_plus[:4]
         self.stance = stance
+
+
+def _follows(value: float, now: float, before: float, then: float) -> bool:
+    """Whether a motion leads from one angle in rad to another, instants in s."""
+    return abs(value - before) <= FASTEST * (now - then) + NOISE
 
 
 class ModelEstimator(StampedEstimator):
