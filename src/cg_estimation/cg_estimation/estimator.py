@@ -10,8 +10,8 @@ here, by their stamps alone:
 
 - a repeated stamp changes nothing; one older than the last is counted and ignored;
 - a channel that is absent or not finite corrects nothing, the model goes on without it;
-- a gap is predicted across; after a longer one than `longest_gap`, of all channels or of one of the
-  angles, the estimate starts anew;
+- a gap is predicted across; after a longer one than `longest_gap`, of all channels or of one of
+  the angles, the estimate starts anew;
 - an angle that jumps further than any motion does is left out; if the readings after it agree with
   it, its zero has moved (somebody took a new one), and the estimate starts anew;
 - a new stance leg means that the swing foot has landed: the impact map (Eq. 4.11) acts on the

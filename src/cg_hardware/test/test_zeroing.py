@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip('canopen')
 
 from emulated_robot import Emulated
-from test_can_drive import enabled, spin
+from test_can_drive import HELD_UP, enabled, spin
 
 from cg_hardware.drive.can_drive import CanDrive
 from cg_hardware.drive.cia402 import State
@@ -60,13 +60,6 @@ def over(drive, patience=30.0):
     assert spin(drive, patience, until=lambda: drive.procedure.over)
     procedure, drive.procedure = drive.procedure, None
     return procedure
-
-
-# What a machine that is too busy for real time looks like.
-HELD_UP = (
-    'the drive is silent', 'heartbeat of the host is missing (0x8130)',
-    'commands on the bus are missing (0x8250)',
-)  # fmt: skip
 
 
 def homed(robot, drive, begins=0.0, meanwhile=None, **settings):

@@ -18,6 +18,8 @@ from cg_description.reading import parse_yaml, read_text
 FORMAT = 'cg_encoder_zero/1'
 PARALLEL = 'legs parallel'  # how a zero is taken without an index
 LARGEST = 2**31
+# What a file says besides, for people.
+KEPT = {'how': str, 'method': int, 'offset_rad': float, 'taken_at': str, 'taken_by': str}
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class EncoderZero:
     """
 
     zero_counts: int
-    how: str
+    how: str = ''
     method: int = 0
     offset_rad: float = 0.0
     taken_at: str = ''
@@ -77,4 +79,5 @@ def read_zero(path: str) -> EncoderZero | None:
     counts = found.get('zero_counts')
     if type(counts) is not int or not abs(counts) < LARGEST:
         raise ValueError(f'{file}: zero_counts must be a whole number below 2^31')
-    return EncoderZero(counts, str(found.get('how', '')), taken_at=str(found.get('taken_at', '')))
+    told = {k: found[k] for k, kind in KEPT.items() if isinstance(found.get(k), kind)}
+    return EncoderZero(counts, **told)
