@@ -18,6 +18,7 @@ from pathlib import Path
 from cg_bringup.runs import NodeOf
 from cg_bringup.supervisor import ProcessDied, supervised
 from cg_dynamics.stop_request import Stopped
+from cg_hardware.drive.settings import read_settings
 from cg_interfaces import topics
 
 RATE_HZ = 500.0
@@ -26,7 +27,8 @@ MISSING = 0.1  # s without requests after which a person must look; busy hosts m
 BLIND = 0.02  # s without the encoder
 NEXT = (
     'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright and '
-    'still), /safety_gate/arm, /drive/enable. /safety_gate/stop is the emergency stop'
+    'still; or /drive/home, /drive/index_by_hand), /safety_gate/arm, /drive/enable. '
+    '/safety_gate/stop is the emergency stop'
 )
 FALLEN = 0.6  # rad of the stance leg
 
@@ -48,6 +50,8 @@ class RobotOptions:
         gear: Torque at the joint per torque of the motor.
         counts_per_turn: Of the encoder, per turn of the joint.
         torque_limit: In N m.
+        drive_zero_file: Keeps the zero of the hip; empty for none.
+        drive_settings: YAML file with more parameters of the drive node; they come before these.
         model: Model file of observer and controller; empty for the nominal one.
         epsilon: Of the observer, s.
     """
@@ -64,20 +68,27 @@ class RobotOptions:
     gear: float = 1.0
     counts_per_turn: float = 20_000.0
     torque_limit: float = 40.0
+    drive_zero_file: str = ''
+    drive_settings: str = ''
     model: str = ''
     epsilon: float = 0.2
 
 
 def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
-    """Node name -> what to start, in the order of ending."""
+    """Node name -> what to start, in the order of ending.
+
+    Raises:
+        ValueError: The file of the drive's settings cannot be used.
+    """
+    more = read_settings(options.drive_settings) if options.drive_settings else {}
     gate = {'torque_limit': options.torque_limit, 'sample_rate_hz': RATE_HZ}
     model = {'model_file': options.model, 'sample_rate_hz': RATE_HZ}
     return {
         'drive': NodeOf('cg_hardware', 'drive_node', gate | {
             'stale_after': STALE, 'interface': options.interface, 'channel': options.channel,
             'node_id': options.drive, 'sign': options.drive_sign, 'gear': options.gear,
-            'counts_per_turn': options.counts_per_turn,
-        }),
+            'counts_per_turn': options.counts_per_turn, 'zero_file': options.drive_zero_file,
+        } | more),
         'imu': NodeOf('cg_hardware', 'imu_node', {
             'port': options.imu, 'baud': options.baud, 'rate_hz': RATE_HZ, 'axis': options.axis,
             'sign': options.imu_sign, 'zero_file': options.zero_file,
@@ -107,6 +118,8 @@ TOLD = {
     'gear': 'torque at the joint per torque of the motor',
     'counts_per_turn': 'of the encoder, per turn of the joint',
     'torque_limit': 'N m',
+    'drive_zero_file': 'keeps the zero of the hip; empty for none',
+    'drive_settings': 'YAML file: more parameters of the drive node, before those given here',
     'model': 'model of observer and controller, a file or a name; empty: nominal',
     'epsilon': 'time constant of the observer, s',
 }
@@ -158,7 +171,7 @@ def main(args: list[str] | None = None) -> int:
         return 1
     except Stopped as stopped:
         return stopped.status
-    except OSError as error:
+    except (ValueError, OSError) as error:
         print(f'robot: {error}', file=sys.stderr)
         return 2
     return 0

@@ -8,7 +8,7 @@ import pytest
 from cg_hardware.drive.feet import FootRetraction
 from cg_hardware.drive.objects import AbsentError, DriveError
 from cg_hardware.drive.readings import Level, Limits, Quantity, Reading
-from cg_hardware.drive.settings import DriveSettings
+from cg_hardware.drive.settings import DriveSettings, read_settings
 from cg_hardware.drive.zero import EncoderZero, read_zero
 
 HEAT = Quantity('temperature of the drive', 'degC', 0x2E10, 1, 0.1, signed=True)
@@ -101,6 +101,29 @@ def test_a_foot_is_in_while_somebody_asks_and_the_drive_is_enabled():
 def test_settings_that_are_refused(settings, said):
     with pytest.raises(ValueError, match=said):
         DriveSettings(**settings)
+
+
+def test_settings_from_a_file(tmp_path):
+    file = tmp_path / 'drive.yaml'
+    file.write_text('gear: 50\nwatch: guarding\nhoming_method: 33\n')
+    assert read_settings(str(file)) == {'gear': 50.0, 'watch': 'guarding', 'homing_method': 33}
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('geer: 50', "drive.yaml: the drive node has no parameter 'geer'"),
+        ('node_id: 1.5', 'drive.yaml: node_id is 1.5; a int is needed'),
+        ('absolute_encoder: 1', 'absolute_encoder is 1; a bool is needed'),
+        ('homing_speed: -1.0', 'drive.yaml: homing_speed is -1.0; allowed is 0.001 to 2.0'),
+        ('- 1', 'must be a mapping'),
+    ],
+)
+def test_a_file_of_settings_that_is_refused(tmp_path, text, said):
+    file = tmp_path / 'drive.yaml'
+    file.write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_settings(str(file))
 
 
 def test_a_homing_in_the_units_of_the_drive():
