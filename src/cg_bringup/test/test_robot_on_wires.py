@@ -15,13 +15,15 @@ pytest.importorskip('canopen')
 pytest.importorskip('serial')
 
 import wired_robot
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from wired_robot import FAULTS, connected, options_in
 
 from cg_bringup.robot_run import robot_nodes
 from cg_bringup.runs import NodeOf
+from cg_hardware.emulators.robot import INDEX
 from cg_interfaces import topics
-from cg_interfaces.ros import LATCHED_QOS
+from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS
 from cg_sysid import Model, Options, diagnose, read_bag
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow]
@@ -83,6 +85,37 @@ def test_whatever_happens_the_torque_is_zero_in_time_and_stays_zero(standing, fa
     robot.ask('can_back')
     person.wait(1.0)
     assert robot.report()['changes'] == []
+
+
+@pytest.mark.evidence
+def test_homing_moves_the_zero_and_no_rate_comes_of_it(tmp_path):
+    nodes = robot_nodes(options_in(tmp_path))
+    nodes['observer'] = replace(nodes['observer'], parameters={
+        **nodes['observer'].parameters, 'stance': 'inner',
+    })  # fmt: skip
+    words = '--model compass_gait_mit --state 0 0 --setup'.split()
+    with connected(nodes, tmp_path, *words, SETUP) as (robot, person, _):
+        states, zero = [], ['']
+        person.node.create_subscription(JointState, topics.STATE, states.append, SENSOR_QOS)
+        person.node.create_subscription(
+            String, topics.ZERO_STATE, lambda m: zero.append(m.data), LATCHED_QOS
+        )
+        person.until(lambda: person.stage == 'idle' and len(states) > 500)
+        # The encoder woke up at some count, 3.9 rad from where the legs are parallel.
+        assert states[-1].position[0] - states[-1].position[1] == pytest.approx(3.88, abs=0.05)
+        for _ in range(5):  # a busy machine ends a homing
+            assert person.press('/drive/home').success
+            person.until(lambda: zero[-1].startswith('known') or 'failed' in zero[-1])
+            if zero[-1].startswith('known'):
+                break
+        robot.ask('hold')
+        states.clear()
+        person.until(lambda: len(states) > 1000)
+        report = robot.report()
+    hips = [m.position[0] - m.position[1] for m in states[500:]]
+    assert hips[-1] == pytest.approx(report['hip'] - INDEX, abs=5e-3)
+    # Of a jump of 3.9 rad in 2 ms they would be hundreds of rad/s.
+    assert max(abs(rate) for m in states for rate in m.velocity) < 3.0
 
 
 DELAY = 0.009  # s that the emulated drive's current takes, and nobody knows of
