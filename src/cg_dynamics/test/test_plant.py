@@ -86,3 +86,13 @@ def test_steps_shorter_than_the_least_do_not_land(bare):
     for _ in range(200):
         machine.advance()
     assert machine.stance == 'inner'
+
+
+def test_a_body_that_is_put_somewhere_rests_there_and_is_measured_there():
+    plant = Plant(MODEL, Setup(), X0)
+    plant.advance()
+    plant.place({'q_outer': 0.4})
+    np.testing.assert_allclose(plant.state[[1, 2, 3]], [0.4, 0.0, 0.0])
+    measured = plant.measure().outputs
+    noise = 6 * 5e-4  # rad, of the sensors, and some counts
+    assert measured['hip_angle'] == pytest.approx(plant.state[0] - 0.4, abs=noise)

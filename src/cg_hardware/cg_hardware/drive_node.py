@@ -22,6 +22,7 @@ out   /hip_encoder, /hip_encoder/counts, /applied_torque, /drive_enabled, /foot_
       /foot_contact/outer, /battery_state, /drive/temperature, /drive/zero_state, /diagnostics
 """
 
+import contextlib
 import time
 from functools import partial
 
@@ -61,6 +62,7 @@ NANOSECONDS = 1_000_000_000
 RETRY = 1.0  # s between attempts to find the drive
 WITHIN = 0.0012  # s after a SYNC in which the drive answers, as a rule
 PRIORITY = -10  # niceness, where it may be had
+FAREWELL = 0.5  # s that a procedure is given to leave the drive as it was, when the node ends
 MOST_BEHIND = 5  # cycles that a late node leaves out rather than catches up
 UNKNOWN = 'unknown: call /drive/zero (legs parallel), /drive/home or /drive/index_by_hand'
 # Stages of a robot whose zero may be sought; one that no gate watches has none.
@@ -110,7 +112,7 @@ class DriveNode(Node):
         self.zero_holds = self.zero is not None
         self.voltage: Reading | None = None
         self.temperature: Reading | None = None
-        self._stage = ''
+        self._stage, self._stopped = '', False
         self._counts: int | None = None
         self._max_torque: int | None = None  # that the drive must be given back
         self._retry_at = self._next_diagnosis = 0.0
@@ -183,13 +185,14 @@ class DriveNode(Node):
     def _lose(self, problem: str) -> None:
         """The drive is looked for anew; until then nobody knows whether it had power."""
         assert self.drive is not None
+        news = f'{self.procedure.name} failed: {problem}' if self.procedure else ''
         if isinstance(self.procedure, Homing):
             self._max_torque = self.procedure.max_torque
         self.drive.close()
         self.drive = self.voltage = self.temperature = self._counts = None
         self._problem = problem
         self.zero_holds = self.zero_holds and self.settings.absolute_encoder
-        self._tell_zero()
+        self._tell_zero(news)
         self.out.enabled(False)
         self._warn(f'{problem}; torque is zero until ~/enable')
         self._retry_at = time.monotonic() + RETRY
@@ -293,6 +296,8 @@ class DriveNode(Node):
         """Why the zero may not be sought now; empty if it may."""
         if not self._at_ease:
             return f'not while the robot is {self._stage}'
+        if self._stopped:
+            return 'not while the emergency stop is pressed'
         if self.procedure is not None:
             return f'{self.procedure.name} is under way: ~/disable ends it'
         if self.drive is not None and self.drive.wanted:
@@ -303,7 +308,7 @@ class DriveNode(Node):
         """A procedure is over."""
         assert self.drive is not None
         if not procedure.tidy:
-            self._lose(f'{procedure.name}: {procedure.failure}')
+            self._lose(procedure.failure)
             return
         self.drive.procedure = None
         if procedure.index is None:
@@ -352,6 +357,7 @@ class DriveNode(Node):
 
     def on_emergency_stop(self, message: Bool) -> None:
         """Of the zero that is sought; that of the torque is the gate's."""
+        self._stopped = message.data
         if message.data and self.procedure is not None:
             self.procedure.cancel('emergency stop')
 
@@ -449,9 +455,16 @@ class DriveNode(Node):
 
     def close(self) -> None:
         """Leave the drive without torque."""
-        if self.drive is not None:
-            self.drive.disable('the node ends')
-            self.drive.close()
+        if self.drive is None:
+            return
+        self.drive.disable('the node ends')
+        deadline = time.monotonic() + FAREWELL
+        with contextlib.suppress(DriveError):
+            # Whatever sought the zero leaves the drive as it was.
+            while self.procedure and not self.procedure.over and time.monotonic() < deadline:
+                self.drive.cycle(0.0)
+                self.drive.await_answer(WITHIN)
+        self.drive.close()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -17,6 +17,7 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature  # noqa: E402
 from std_msgs.msg import Bool, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from cg_hardware.drive.can_drive import CanDrive  # noqa: E402
 from cg_hardware.drive.zero import read_zero  # noqa: E402
 from cg_hardware.drive_node import DriveNode  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
@@ -181,6 +182,11 @@ def test_a_robot_that_is_not_at_ease_is_not_homed(make, stage):
         assert (answer.success, answer.message) == (False, f'not while the robot is {stage}')
     bench.stage.publish(String(data='idle'))
     bench.until(lambda: bench.node._stage == 'idle')
+    bench.stop.publish(Bool(data=True))
+    bench.until(lambda: bench.node._stopped)
+    assert bench.call('home').message == 'not while the emergency stop is pressed'
+    bench.stop.publish(Bool(data=False))
+    bench.until(lambda: not bench.node._stopped)
     assert bench.call('home').success
     for service in ('home', 'index_by_hand', 'enable', 'zero'):
         assert 'homing is under way: ~/disable ends it' in bench.call(service).message
@@ -208,6 +214,24 @@ def test_a_homing_is_stopped(make, who):
     assert f'homing failed: {why}' in bench.zero_state
     assert 'unknown' in bench.zero_state  # the counts may have begun anew
     assert bench.robot.report()['acting'] == 0
+
+
+def test_a_node_that_ends_while_the_drive_homes_leaves_it_as_it_was(make):
+    bench = make(homing_method=33, homing_travel=6.0)
+    drive = bench.node.drive
+    for _ in range(5):
+        assert bench.call('home').success
+        bench.until(lambda: bench.node.procedure is None or bench.robot.report()['acting'])
+        if bench.node.procedure is not None:
+            break
+    bench.node.close()
+    assert bench.robot.report()['acting'] == 0
+    again = CanDrive(bench.node.settings.bus, 1)
+    try:
+        assert drive.procedure.tidy
+        assert again.objects.read(0x6072) == 1000
+    finally:
+        again.close()
 
 
 def test_an_absolute_encoder_needs_no_homing(make, tmp_path):

@@ -125,19 +125,21 @@ class DriveSettings(GateSettings):
         maximum=300.0, live=True,
     )  # fmt: skip
     voltage_low_error: float = setting(
-        0.0, 'of the DC link (0x6079) at which the drive is disabled, 0 for none', unit='V',
+        0.0, 'of the DC link (0x6079), so low that the drive is disabled, 0 for none', unit='V',
         minimum=0.0, maximum=1000.0, live=True,
     )  # fmt: skip
     voltage_low_warn: float = setting(
-        0.0, 'of the DC link at which people are warned, 0 for none', unit='V', minimum=0.0,
+        0.0, 'of the DC link, so low that people are warned, 0 for none', unit='V', minimum=0.0,
         maximum=1000.0, live=True,
     )  # fmt: skip
     voltage_high_warn: float = setting(
-        0.0, 'the same from below, 0 for none', unit='V', minimum=0.0, maximum=1000.0, live=True
-    )
+        0.0, 'of the DC link, so high that people are warned, 0 for none', unit='V', minimum=0.0,
+        maximum=1000.0, live=True,
+    )  # fmt: skip
     voltage_high_error: float = setting(
-        0.0, 'the same from below, 0 for none', unit='V', minimum=0.0, maximum=1000.0, live=True
-    )
+        0.0, 'of the DC link, so high that the drive is disabled, 0 for none', unit='V',
+        minimum=0.0, maximum=1000.0, live=True,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
