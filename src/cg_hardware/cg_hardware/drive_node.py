@@ -228,11 +228,15 @@ class DriveNode(Node):
 
     def _read(self) -> None:
         """Publish a reading that has come, and disable a drive whose limit it breaks."""
+        assert self.drive is not None
+        news = False
         if self.voltage is not None and self.voltage.poll():
             self.out.voltage(self.voltage.value)
+            news = True
         if self.temperature is not None and self.temperature.poll():
             self.out.temperature(self.temperature.value)
-        if self.drive is not None and (self.drive.wanted or self.procedure):
+            news = True
+        if news and (self.drive.wanted or self.procedure):
             if problem := self._out_of_limits():
                 self.drive.disable(problem)
 
