@@ -28,6 +28,8 @@ pytestmark = pytest.mark.alone
 HANGING = '--model compass_gait_mit --state 0 0 --setup'.split()
 SETUP = 'stance: inner\nfixture: inner_fixed\n'
 INDEX = 0.06  # rad of the hip, by the emulated encoder
+# What a machine that is too busy for real time looks like.
+HELD_UP = 'the drive is silent', '(0x8130)', '(0x8250)'
 TEMPERATURE = {'temperature_index': 0x2E10, 'temperature_subindex': 1, 'readings_period': 0.1}
 
 
@@ -128,9 +130,6 @@ def make(tmp_path):
         rclpy.try_shutdown()
 
 
-HELD_UP = 'the drive is silent', '(0x8130)', '(0x8250)'
-
-
 def home(bench, service='home'):
     """Seek the zero until the machine has time for it; the last answer."""
     for _ in range(5):
@@ -187,11 +186,22 @@ def test_a_robot_that_is_not_at_ease_is_not_homed(make, stage):
     assert bench.call('home').message == 'not while the emergency stop is pressed'
     bench.stop.publish(Bool(data=False))
     bench.until(lambda: not bench.node._stopped)
-    assert bench.call('home').success
-    for service in ('home', 'index_by_hand', 'enable', 'zero'):
-        assert 'homing is under way: ~/disable ends it' in bench.call(service).message
-    bench.stage.publish(String(data=stage))
-    bench.until(lambda: f'homing failed: the robot is {stage}' in bench.zero_state)
+    for _ in range(5):
+        assert bench.call('home').success
+        said = [bench.call(name).message for name in ('home', 'index_by_hand', 'enable', 'zero')]
+        lasted = bench.node.procedure is not None
+        bench.stage.publish(String(data=stage))
+        bench.until(lambda: bench.node._stage == stage and bench.node.procedure is None)
+        bench.wait(0.1)
+        if lasted and not any(words in bench.zero_state for words in HELD_UP):
+            break
+        bench.stage.publish(String(data='idle'))
+        bench.call('disable')
+        bench.until(lambda: bench.node._stage == 'idle' and bench.node.procedure is None)
+    else:
+        pytest.skip('the host is too busy for real time')
+    assert said == ['homing is under way: ~/disable ends it'] * 4
+    assert f'homing failed: the robot is {stage}' in bench.zero_state
     bench.until(lambda: bench.robot.report()['acting'] == 0)
 
 
