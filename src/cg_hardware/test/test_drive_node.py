@@ -188,8 +188,9 @@ def test_a_robot_that_is_not_at_ease_is_not_homed(make, stage):
     bench.until(lambda: not bench.node._stopped)
     for _ in range(5):
         assert bench.call('home').success
+        begun = bench.node.procedure
         said = [bench.call(name).message for name in ('home', 'index_by_hand', 'enable', 'zero')]
-        lasted = bench.node.procedure is not None
+        lasted = begun is not None and bench.node.procedure is begun
         bench.stage.publish(String(data=stage))
         bench.until(lambda: bench.node._stage == stage and bench.node.procedure is None)
         bench.wait(0.1)
