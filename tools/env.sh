@@ -42,9 +42,15 @@ if [ -n "${CG_DEV:-}" ]; then
 fi
 
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
-export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$_cg_root/tools/fastdds_localhost.xml}
+case ${FASTRTPS_DEFAULT_PROFILES_FILE:-} in # as cg_interfaces/localhost.py has it
+    '' | */fastdds_localhost.xml | */fastdds_network.xml)
+        _cg_profile=localhost
+        [ "$ROS_AUTOMATIC_DISCOVERY_RANGE${ROS_STATIC_PEERS:-}" = LOCALHOST ] || _cg_profile=network
+        export FASTRTPS_DEFAULT_PROFILES_FILE=$_cg_root/src/cg_interfaces/cg_interfaces/fastdds_$_cg_profile.xml
+        ;;
+esac
 export ROS_LOG_DIR=${ROS_LOG_DIR:-$_cg_root/log/ros}
 # Our matrices are small and our work runs in one process per core: threads of BLAS only get in the way.
 export OPENBLAS_NUM_THREADS=${OPENBLAS_NUM_THREADS:-1}
 
-unset _cg_here _cg_root _cg_package _cg_nounset
+unset _cg_here _cg_root _cg_package _cg_nounset _cg_profile

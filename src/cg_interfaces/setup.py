@@ -19,6 +19,7 @@ setup(
         'Topic :: Scientific/Engineering',
     ],
     packages=find_packages(exclude=['test', 'test.*']),
+    package_data={'': ['*.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

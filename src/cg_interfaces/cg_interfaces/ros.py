@@ -36,6 +36,7 @@ from rcl_interfaces.msg import (
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -44,6 +45,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from cg_dynamics.stop_request import StopRequest, end_at_once, end_with_parent
+from cg_interfaces.localhost import keep_to_localhost
 from cg_interfaces.settings import Settings, describe, table
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -238,6 +240,7 @@ def run(
         with contextlib.suppress(PermissionError):
             os.setpriority(os.PRIO_PROCESS, 0, niceness)
     end_with_parent()
+    keep_to_localhost(os.environ)
     # rclpy's own handlers would shut the context down before the node can send its last torque.
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -248,8 +251,9 @@ def run(
         try:
             node = make_node()
             stop = StopRequest()
-        except (ValueError, OSError, ParameterException) as error:
-            print(f'error: {error}', file=sys.stderr)
+        except (ValueError, OSError, ParameterException, rclpy_implementation.RCLError) as error:
+            # The middleware's own errors have lines: no security in it, keys that it refuses.
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 2
         # What stands now stays: a search for garbage among it would cost milliseconds at a time.
         gc.freeze()
