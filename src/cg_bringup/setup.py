@@ -32,7 +32,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *shared('config', 'launch', 'models', 'rviz', 'layouts', 'urdf'),
+        *shared('config', 'launch', 'models', 'rviz', 'layouts', 'security', 'urdf'),
     ],
     python_requires='>=3.10',
     install_requires=[

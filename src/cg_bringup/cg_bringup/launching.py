@@ -23,7 +23,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from cg_bringup.balance_run import MACHINE, verdict_of, with_outcome
-from cg_bringup.runs import NodeOf, parameter_file_text
+from cg_bringup.runs import NodeOf, enclave_arguments, parameter_file_text
 from cg_bringup.verdict import Verdict
 from cg_description.reading import parse_yaml
 from cg_description.schema import ListOf, Number
@@ -102,6 +102,7 @@ def node_actions(
             exec_name=node.executable,
             parameters=[str(parameters)],
             remappings=list(node.remappings),
+            ros_arguments=enclave_arguments(name),
             output='screen',
             # `ros2 launch` keeps the other end of its nodes' standard input.
             additional_env=ON_STDIN,

@@ -21,6 +21,7 @@ PATIENCE = 60.0  # s without progress; on a busy machine processes take that lon
 PEERS = 45.0  # s by which the nodes of a run may start apart
 ENDING = 5.0  # s that a node has to end in when it is told to
 CLOSING = 120.0  # s that the recorder may take to close its bag
+ENCLAVES = '/compass_gait'  # below it, where SROS2 finds key and permissions of a node by its name
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,11 @@ def experiment_nodes(run: Run) -> dict[str, NodeOf]:
         'excitation': NodeOf('cg_sysid', 'excitation_node', excitation),
         'recorder': NodeOf('cg_sysid', 'recorder_node', recorder, ending=CLOSING),
     }
+
+
+def enclave_arguments(name: str) -> list[str]:
+    """ROS arguments that put a node into its enclave; without SROS2 they change nothing."""
+    return ['--enclave', f'{ENCLAVES}/{name}']
 
 
 def parameter_file_text(nodes: Mapping[str, NodeOf]) -> str:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO
 
-from cg_bringup.runs import ENDING, NodeOf, parameter_file_text
+from cg_bringup.runs import ENDING, NodeOf, enclave_arguments, parameter_file_text
 from cg_dynamics.stop_request import ON_STDIN, StopRequest
 
 POLL = 0.02  # s
@@ -152,13 +152,13 @@ def supervised(nodes: Mapping[str, NodeOf], output: IO | None = None) -> Iterato
     with tempfile.TemporaryDirectory(prefix='cg_run_') as directory:
         parameters = Path(directory) / 'parameters.yaml'
         parameters.write_text(parameter_file_text(nodes), encoding='utf-8')
-        modules = {name: _module(node, parameters) for name, node in nodes.items()}
+        modules = {name: _module(name, node, parameters) for name, node in nodes.items()}
         ending = {name: node.ending for name, node in nodes.items()}
         with Supervisor(modules, output, ending) as supervisor:
             yield supervisor
 
 
-def _module(node: NodeOf, parameters: Path) -> list[str]:
+def _module(name: str, node: NodeOf, parameters: Path) -> list[str]:
     remapped = [word for a, b in node.remappings for word in ('-r', f'{a}:={b}')]
-    arguments = ['--ros-args', '--params-file', str(parameters), *remapped]
-    return [f'{node.package}.{node.executable}', *arguments]
+    arguments = ['--params-file', str(parameters), *remapped, *enclave_arguments(name)]
+    return [f'{node.package}.{node.executable}', '--ros-args', *arguments]
