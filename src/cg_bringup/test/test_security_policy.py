@@ -182,7 +182,8 @@ def made(node):
     module = importlib.import_module(f'{node.package}.{node.executable}')
     (kind,) = (
         c for c in vars(module).values()
-        if isinstance(c, type) and issubclass(c, rclpy.node.Node) and c.__module__ == module.__name__
+        if isinstance(c, type) and issubclass(c, rclpy.node.Node)
+        and c.__module__ == module.__name__
     )  # fmt: skip
     remapped = [word for a, b in node.remappings for word in ('-r', f'{a}:={b}')]
     return kind(

@@ -10,8 +10,8 @@ import pytest
 from cg_interfaces.domains import own_domain
 from cg_interfaces.localhost import LOCALHOST, NETWORK, PEERS, PROFILE, RANGE, keep_to_localhost
 
-# A node as `run` starts it, without a shell that prepared anything. It prints the ports and
-# addresses on which it receives: DDS has them by rule, below those that Linux hands out to senders.
+# A node as `run` starts it, without a shell that prepared anything. It prints the addresses and
+# ports on which it receives: DDS has these by rule, below those that Linux hands out to senders.
 NODE = """
 import os, sys
 import rclpy
