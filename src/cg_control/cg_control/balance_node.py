@@ -16,7 +16,6 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -75,8 +74,7 @@ class BalanceNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, BalanceNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        given = settings.model_file
-        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        path = model_path(settings.model_file or NOMINAL_MODEL)
         self.design = LiveDesign(
             path,
             Model.load(path),

@@ -16,7 +16,6 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -93,8 +92,7 @@ class TreeControllerNode(Node):
             self, TreeControllerSettings, at_work=lambda: self.started
         )
         settings = self.declared.values
-        given = settings.model_file
-        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        path = model_path(settings.model_file or NOMINAL_MODEL)
         model = Model.load(path)
         sample_time = 1.0 / settings.sample_rate_hz
         self.design = LiveDesign(path, model, settings, sample_time, log=self.get_logger().info)

@@ -5,8 +5,8 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from cg_control.tree import Tree, TreeError
-from cg_description.reading import parse_json
+from cg_control.tree import LARGEST_FILE, Tree, TreeError
+from cg_description.reading import parse_json, path_of
 from cg_dynamics.model import Model
 
 
@@ -36,7 +36,7 @@ def tree_path(name: str | Path) -> Path:
     Raises:
         TreeError: There is neither; with the path that was tried and the names there are.
     """
-    path = Path(name).expanduser()
+    path = path_of(name, TreeError)
     if path.is_file():
         return path
     shipped = trees_directory() / f'{name}.npz'
@@ -65,10 +65,18 @@ class TreeSelection:
         """The file as it is now.
 
         Raises:
-            TreeError: It cannot be read.
+            TreeError: It cannot be read, or is no file of a size that a tree can have.
         """
+        digest = hashlib.sha256()
         try:
-            digest = hashlib.sha256(path.read_bytes())
+            # The name may come in a message: a device or a pipe would never end.
+            if path.exists() and not path.is_file():
+                raise TreeError(f'{path}: not a file')
+            if path.stat().st_size > LARGEST_FILE:
+                raise TreeError(f'{path}: larger than {LARGEST_FILE} bytes, the most allowed')
+            with path.open('rb') as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
         except OSError as error:
             raise TreeError(f'{path}: {error.strerror or error}') from None
         return cls(str(path.absolute()), digest.hexdigest())
@@ -97,7 +105,7 @@ class TreeSelection:
         Raises:
             TreeError: The file is none of this robot, or has changed since it was selected.
         """
-        path = Path(self.path)
+        path = path_of(self.path, TreeError)
         if TreeSelection.of(path).sha256 != self.sha256:
             raise TreeError(f'{path}: the file has changed since it was selected; load it again')
         return Tree.load(path, model)

@@ -14,7 +14,6 @@ import json
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -74,8 +73,7 @@ class TvlqrNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, TvlqrNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        given = settings.model_file
-        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        path = model_path(settings.model_file or NOMINAL_MODEL)
         self.model = Model.load(path)
         self.design = LiveDesign(
             path,

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from cg_description.model_file import ModelFileError
+from cg_description.reading import path_of
 
 
 def models_directory() -> Path:
@@ -28,7 +29,7 @@ def model_path(name: str | Path) -> Path:
     Raises:
         ModelFileError: There is neither; with the path that was tried and the names there are.
     """
-    path = Path(name).expanduser()
+    path = path_of(name, ModelFileError)
     if path.exists() and not path.is_dir():
         return path
     shipped = models_directory() / f'{name}.yaml'

@@ -23,6 +23,7 @@ SHOWN = 40  # characters of a value or key in a message
 LONGEST_INTEGER = 18  # digits that are read as an integer; longer ones become floating
 LONGEST_NUMBER = 400  # characters that can be a number at all
 TEXT_PER_NODE = 100  # characters of a text that count as one more value
+NO_NAME = re.compile('[\x00-\x1f\x7f\ud800-\udfff]')  # would split messages or steer a terminal
 
 
 class DocumentError(ValueError):
@@ -49,6 +50,44 @@ JSON = Limits(size=8_000_000, depth=40, nodes=300_000)
 JSON_LOG = Limits(size=400_000_000, depth=40, nodes=20_000_000)  # of samples, not of settings
 
 
+def path_of(name: str | Path, error: type[Exception] = DocumentError) -> Path:
+    """The path that somebody means by a name, `~` included, whether or not it is there.
+
+    Raises:
+        error: No file can have that name.
+    """
+    if NO_NAME.search(str(name)):
+        raise error(f'{shown(str(name))} is no name of a file')
+    try:
+        path = Path(name).expanduser()
+        path.exists()
+    except OSError as problem:
+        raise error(f'{shown(str(name))}: {problem.strerror}') from None
+    except (RuntimeError, ValueError):  # the home of nobody; no text
+        raise error(f'{shown(str(name))} is no name of a file') from None
+    return path
+
+
+def path_below(folder: Path, name: str, where: str, error: type[Exception]) -> Path:
+    """The path of a file that is named inside another one: in its folder or below.
+
+    A symbolic link there leads where its owner wanted.
+
+    Args:
+        folder: Of the file that has the name in it.
+        name: Relative, without `..`.
+        where: Place of the name, for the message.
+        error: Kind of the error to raise.
+
+    Raises:
+        error: The name leads out of the folder, or no file can have it.
+    """
+    path = path_of(name, error)
+    if path.is_absolute() or not path.parts or '..' in path.parts:
+        raise error(f'{where}: {shown(name)} leads out of {folder}; a file in it is needed')
+    return folder / path
+
+
 def read_text(
     path: str | Path, error: type[Exception] = DocumentError, limits: Limits = YAML
 ) -> str:
@@ -58,11 +97,13 @@ def read_text(
         error: It cannot be opened, is too large or is not UTF-8.
     """
     try:
+        if NO_NAME.search(str(path)):
+            raise ValueError
         with open(path, 'rb') as file:
             raw = file.read(limits.size + 1)
     except OSError as problem:
         raise error(f'{path}: cannot be read: {problem.strerror}') from None
-    except ValueError:  # a zero byte in the name
+    except ValueError:
         raise error(f'{shown(str(path))} is no name of a file') from None
     if len(raw) > limits.size:
         raise error(f'{path}: larger than {limits.size / 1e6:g} MB, the most that is read')

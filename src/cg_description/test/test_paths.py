@@ -33,7 +33,7 @@ def test_a_file_comes_before_a_name_and_a_directory_does_not(elsewhere):
 
 
 @pytest.mark.parametrize(
-    'name', ['compass_gait', 'mine.yaml', '', '.', '../models/compass_gait_mit', 'a\0b']
+    'name', ['compass_gait', 'mine.yaml', '', '.', '../models/compass_gait_mit']
 )
 def test_what_is_neither_is_refused_with_what_was_tried(name, elsewhere):
     with pytest.raises(ModelFileError) as refused:

@@ -11,7 +11,6 @@ out   /state, /diagnostics
 import time
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
@@ -62,8 +61,7 @@ class ObserverNode(Node):
         self.started = False
         self.declared = DeclaredSettings(self, ObserverNodeSettings, at_work=lambda: self.started)
         settings = self.declared.values
-        given = settings.model_file
-        path = Path(given).expanduser() if given else model_path(NOMINAL_MODEL)
+        path = model_path(settings.model_file or NOMINAL_MODEL)
         told = settings.stance == 'contacts'
         model = Model.load(path)
         self.estimator = make_estimator(

@@ -19,7 +19,6 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from pathlib import Path
 
 import serial
 import yaml
@@ -29,7 +28,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from cg_description.model_file import write_atomically
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import parse_yaml, path_of, read_text
 from cg_hardware.imu import gx3
 from cg_hardware.imu.device_clock import DeviceClock
 from cg_hardware.imu.mounting import AXES, Mounting, MountingError, mounting_of, zero_of
@@ -279,7 +278,7 @@ def read_zero(path: str) -> float:
     Raises:
         ValueError: naming the file and what is wrong in it.
     """
-    file = Path(path).expanduser()
+    file = path_of(path)
     if not file.exists():
         return 0.0
     found = parse_yaml(read_text(file), str(file))
@@ -297,7 +296,7 @@ def write_zero(path: str, mounting: Mounting, zero) -> None:
         'taken_at': datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
         'taken_by': os.environ.get('USER', 'unknown'),
     }  # fmt: skip
-    write_atomically(Path(path).expanduser(), yaml.safe_dump(record, sort_keys=False))
+    write_atomically(path_of(path), yaml.safe_dump(record, sort_keys=False))
 
 
 def main(args: list[str] | None = None) -> int:

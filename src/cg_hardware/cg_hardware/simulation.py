@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from cg_description.paths import model_path
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import parse_yaml, path_of, read_text
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
@@ -143,7 +143,7 @@ def read_setup(text: str) -> Setup:
     """
     source = text
     if text and '\n' not in text and ':' not in text:
-        source = read_text(Path(text).expanduser())
+        source = read_text(path_of(text))
     return Setup.from_dict(parse_yaml(source, 'setup'))
 
 

@@ -18,7 +18,6 @@ out   /applied_torque, /experiment, /diagnostics, /clock (lockstep); of a compas
 import math
 import time
 from datetime import datetime, timezone
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -26,6 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
+from cg_description.reading import path_of
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
@@ -504,7 +504,7 @@ class SimulationNode(LifecycleNode):
             self.sensors.publish_applied(self._stamp(), (0.0,) * len(self.joints))
         self._stop()
         if self.standing is not None and self.settings.outcome_file:
-            self.standing.outcome.save(Path(self.settings.outcome_file).expanduser())
+            self.standing.outcome.save(path_of(self.settings.outcome_file))
 
 
 def main(args: list[str] | None = None) -> int:

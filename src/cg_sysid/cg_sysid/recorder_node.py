@@ -11,12 +11,12 @@ import functools
 import importlib
 import os
 import time
-from pathlib import Path
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
+from cg_description.reading import path_of
 from cg_interfaces import topics
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run, to_stamp
 from cg_interfaces.topics import EXPERIMENT
@@ -48,7 +48,7 @@ class RecorderNode(Node):
         topics = topics_to_record(settings)
         self.expected = expected_topics(settings)
         self.recording = Recording(
-            Path(settings.bag).expanduser(),
+            path_of(settings.bag),
             topics,
             settings.time == 'stamp',
             self.expected,

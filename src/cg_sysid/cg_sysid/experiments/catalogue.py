@@ -8,7 +8,7 @@ from dataclasses import Field, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import parse_yaml, path_below, path_of, read_text
 from cg_description.schema import Key, Kind, ListOf, Number, Text, Whole
 from cg_description.schema import Mapping as Form
 from cg_dynamics import rig
@@ -85,7 +85,9 @@ def load_experiment(name: str) -> Experiment:
     Raises:
         ExperimentError: naming what is wrong and what is allowed.
     """
-    path = Path(name) if name.endswith('.yaml') else experiments_directory() / f'{name}.yaml'
+    path = path_of(name, ExperimentError)
+    if path.name == name and path.suffix != '.yaml':
+        path = experiments_directory() / f'{name}.yaml'
     if not path.is_file():
         known = ', '.join(experiment_names())
         raise ExperimentError(f'no experiment {name!r}; there are: {known}')
@@ -112,7 +114,9 @@ def parse_experiment(path: Path, entries: Any) -> Experiment:
     tree = SCHEMA.of(entries, str(path), ExperimentError)
     excitation = tree['excitation']
     if excitation.get('kind') == 'file' and excitation.get('file'):
-        excitation['file'] = str((path.parent / excitation['file']).resolve())
+        named = excitation['file']
+        file = path_below(path.parent, named, f'{path}: excitation.file', ExperimentError)
+        excitation['file'] = str(file.resolve())
     try:
         ExcitationSettings(**excitation, duration=tree['duration'])
         setup = Setup.from_dict(tree['setup'])

@@ -5,11 +5,11 @@ looked through first, within the limits of interfaces.md.
 """
 
 import sqlite3
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import zstandard
 
-from cg_description.reading import Limits, parse_yaml, read_text
+from cg_description.reading import Limits, parse_yaml, path_below, read_text, shown
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.mcap_records import LARGEST_CHUNK, MAGIC, is_bounded_zstd
 from cg_sysid.records.mcap_scan import LARGEST_RATIO, Survey, messages, survey
@@ -17,6 +17,7 @@ from cg_sysid.records.recover import METADATA, needs_recovery
 
 LOGS = ('.csv', '.mat', '.json')  # what an import is needed for
 METADATA_LIMITS = Limits(size=1024 * 1024, depth=40, nodes=100_000)
+STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}  # storage plugin -> ending of its files
 STEP = 1024 * 1024
 
 
@@ -65,6 +66,7 @@ def _checked_metadata(file: Path) -> str:
                       METADATA_LIMITS)  # fmt: skip
     try:
         information = tree['rosbag2_bagfile_information']
+        _require_own_files(file, information)
         for topic in information['topics_with_message_count']:
             # A text of YAML in older bags.
             qos = topic['topic_metadata'].get('offered_qos_profiles')
@@ -74,8 +76,27 @@ def _checked_metadata(file: Path) -> str:
     except (KeyError, TypeError, AttributeError):
         raise RecordingError(
             f'{file}: not a readable rosbag2 recording: `rosbag2_bagfile_information` with its '
-            '`topics_with_message_count` is needed'
+            'storage_identifier, relative_file_paths and topics_with_message_count is needed'
         ) from None
+
+
+def _require_own_files(metadata: Path, information: dict) -> None:
+    """Every file that is named must be one that was looked through."""
+    suffix = STORAGE.get(information['storage_identifier'])
+    # Before version 4 the folder's own name came first.
+    deepest = 1 if information.get('version', 0) >= 4 else 2
+    named = {'relative_file_paths': list(information['relative_file_paths'])}
+    named['files'] = [entry['path'] for entry in information.get('files') or ()]
+    for key, names in named.items():
+        for name in map(str, names):
+            place = f'{metadata}: {key}'
+            path_below(metadata.parent, name, place, RecordingError)
+            own = len(PurePath(name).parts) <= deepest
+            if not own or (suffix and not name.removesuffix('.zstd').endswith(suffix)):
+                raise RecordingError(
+                    f'{place}: {shown(name)} is no storage file of this bag; the name of one '
+                    f'in its folder is needed, such as {metadata.parent.name}_0{suffix or ""}'
+                )
 
 
 def _rows(file: Path):

@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import parse_yaml, path_of, read_text
 from cg_description.schema import Mapping as Form
 from cg_interfaces import channels
 from cg_interfaces.channels import STRING, Topic
@@ -82,7 +82,7 @@ def read_raw(
         RecordingError: This is no bag, it is cut off, it has no usable note, or a topic that
             the analysis reads has another message type.
     """
-    path = Path(path)
+    path = path_of(path, RecordingError)
     if not path.exists():
         raise RecordingError(f'{path}: no such file or directory')
     if path.is_dir() and not (path / 'metadata.yaml').exists():

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from cg_description.reading import parse_yaml, read_text, shown
+from cg_description.reading import parse_yaml, path_of, read_text, shown
 from cg_description.schema import (
     NAME,
     Key,
@@ -195,8 +195,8 @@ def load_mapping(name: str | Path) -> dict[str, Any]:
     Raises:
         RecordingError: No such mapping, not YAML, or an entry that is unknown, missing or wrong.
     """
-    path = Path(name)
-    if path.suffix not in ('.yaml', '.yml'):
+    path = path_of(name, RecordingError)
+    if path.name == str(name) and path.suffix not in ('.yaml', '.yml'):
         path = mapping_folder() / f'{name}.yaml'
     if not path.is_file():
         msg = f'no mapping {str(name)!r}; those that come along are {", ".join(mapping_names())}'
