@@ -1,4 +1,4 @@
-"""No name in a file or a message leads out of its folder, and no name at all ends in a traceback."""
+"""No name in a file or message leads out of its folder, and none at all ends in a traceback."""
 
 import os
 import resource
@@ -35,7 +35,7 @@ READERS = {
 
 def refused(read, *arguments):
     """The one line with which something is refused."""
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match='.') as caught:
         read(*arguments)
     message = str(caught.value)
     assert message.isprintable(), message
