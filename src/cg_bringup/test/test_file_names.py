@@ -35,7 +35,7 @@ READERS = {
 
 def refused(read, *arguments):
     """The one line with which something is refused."""
-    with pytest.raises(ValueError, match='.') as caught:
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - its words are judged below
         read(*arguments)
     message = str(caught.value)
     assert message.isprintable(), message
