@@ -14,24 +14,20 @@ out   /imu, /diagnostics
 """
 
 import math
-import os
 import time
 from collections import deque
 from dataclasses import dataclass
-from datetime import datetime, timezone
 
 import serial
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from cg_description.model_file import write_atomically
-from cg_description.reading import parse_yaml, path_of, read_text
 from cg_hardware.imu import gx3
 from cg_hardware.imu.device_clock import DeviceClock
 from cg_hardware.imu.mounting import AXES, Mounting, MountingError, mounting_of, zero_of
+from cg_hardware.imu.zero_file import read_zero, write_zero
 from cg_interfaces import topics
 from cg_interfaces.ros import (
     MACHINE_QOS,
@@ -270,33 +266,6 @@ class ImuNode(Node):
                 self.line.close()
             except (serial.SerialException, OSError):
                 pass  # a plug that is pulled
-
-
-def read_zero(path: str) -> float:
-    """The zero in rad that a file keeps; 0 where there is no such file.
-
-    Raises:
-        ValueError: naming the file and what is wrong in it.
-    """
-    file = path_of(path)
-    if not file.exists():
-        return 0.0
-    found = parse_yaml(read_text(file), str(file))
-    zero = found.get('zero_rad') if isinstance(found, dict) else None
-    if not isinstance(zero, int | float) or not abs(zero) <= math.pi:
-        raise ValueError(f'{file}: zero_rad must be an angle in rad, from -pi to pi')
-    return float(zero)
-
-
-def write_zero(path: str, mounting: Mounting, zero) -> None:
-    """Keep a zero, with when it was taken, by whom, and how still the legs were."""
-    record = {
-        'format': 'cg_zero/1', 'zero_rad': zero.angle, 'axis': mounting.axis,
-        'sign': mounting.sign, 'still_rad': zero.still, 'samples': zero.samples,
-        'taken_at': datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
-        'taken_by': os.environ.get('USER', 'unknown'),
-    }  # fmt: skip
-    write_atomically(path_of(path), yaml.safe_dump(record, sort_keys=False))
 
 
 def main(args: list[str] | None = None) -> int:

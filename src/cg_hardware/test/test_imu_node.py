@@ -16,7 +16,8 @@ from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from cg_hardware.imu_node import ImuNode, read_zero  # noqa: E402
+from cg_hardware.imu.zero_file import read_zero  # noqa: E402
+from cg_hardware.imu_node import ImuNode  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
 from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds  # noqa: E402
 
@@ -142,8 +143,10 @@ def test_a_zero_is_taken_kept_and_read_again(bench, tmp_path):
 @pytest.mark.parametrize(
     ('text', 'said'),
     [
-        ('zero_rad: 9.0\n', 'must be an angle'),
-        ('[]\n', 'zero_rad must be'),
+        ('format: cg_zero/1\nzero_rad: 9.0\n', 'zero_rad: 9.0 .* from -3.14159 to 3.14159'),
+        ('format: cg_zero/1\nzero_rad: true\n', 'zero_rad: true is no number'),
+        ('zero_rad: 0.1\n', 'format'),
+        ('[]\n', 'mapping'),
         ('a: [\n', 'zero.yaml'),
     ],
 )
