@@ -1,60 +1,82 @@
 """Mutants of every file that people write or pass on, read by the readers that meet them.
 
-    ./cg exec python bench/fuzz_readers.py [--inputs 1000000] [--readers model note] [--write FILE]
+    nice -n 19 ./cg exec python bench/fuzz_readers.py [--inputs 1000000] [--seconds 300]
+        [--readers model note] [--write FILE]
 
 A mutant is a sound file with bytes or words changed, with entries deleted, renamed, swapped for
 odd values or wrapped, or with a bomb in it: deep nesting, aliases of aliases, endless numbers,
-texts, keys. A reader must take it, or refuse it by an error of its own: one line, short, without
-the words of the interpreter. Each mutant follows from reader and number alone (`--replay`).
+texts, keys. Files of arrays are also changed inside, with sums that fit, so that the damage gets
+past the archive. A reader must take it, or refuse it by an error of its own: one line, short,
+without the words of the interpreter. Each mutant follows from reader and number alone
+(`--replay`).
 
 Counted are *crashes* (any other exception), *unclear* (an error of more than a line or 1000
 characters, or in the words of the interpreter), the longest CPU time and the growth of the
-process's largest memory over a whole run.
+process's largest memory over a whole run; a second and 200 MB are allowed. A reader that takes
+more than 1 ms for an input ends after `--seconds` of CPU time, with as many as that makes.
+
+Files of parameters are not here: rcl reads them. Nor is the URDF, which is only written.
 """
 
 import argparse
 import copy
 import functools
+import io
 import json
+import math
 import random
 import re
 import resource
+import shutil
+import struct
 import sys
 import tempfile
 import time
 import traceback
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+import scipy.io
 import yaml
 
 from cg_bringup.hidden import hidden_effects_file
 from cg_control.basin import SHIPPED, shipped_file
+from cg_control.nodes import Nodes
 from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_control.tree import Tree, TreeError
+from cg_control.tree_files import TreeSelection
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path, models_directory
 from cg_description.reading import DocumentError, parse_yaml, read_text
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_hardware.imu.zero_file import read_zero
 from cg_hardware.simulation import read_setup
 from cg_sysid.errors import RecordingError
 from cg_sysid.experiments.catalogue import ExperimentError, experiments_directory, load_experiment
 from cg_sysid.experiments.excitation import CommandFileError, playback
-from cg_sysid.records.bags import load_note, parse_note
+from cg_sysid.identification.identify import _End
+from cg_sysid.identification.kept_fits import recall
+from cg_sysid.records.bags import load_note, parse_note, read_bag, write_bag
 from cg_sysid.records.importing import import_logs, mapping_folder
+from cg_sysid.records.record import Record
 from cg_sysid.records.tables import read_table
+from cg_sysid.report import curves
 from cg_sysid.report.diagnosis_file import read_facts
 
 OURS = (DocumentError, RecordingError, TrajectoryError, ExperimentError, DynamicsError,
-        CommandFileError)  # fmt: skip
+        CommandFileError, TreeError, curves.CurvesError)  # fmt: skip
 # Signs of an error that comes out of the interpreter or a library and not out of a reader.
 FOREIGN = re.compile(
     r"<class|NoneType|object at 0x|dtype|Errno|invalid literal|could not convert|codec can't|"
     r'Traceback|tuple index|unhashable|unexpected keyword|has no attribute|inhomogeneous'
 )
 ALLOWED_S, ALLOWED_MB = 1.0, 200.0
+SLOW_S = 1e-3  # of CPU for an input, mutation included, from which on a reader has a time limit
 
 MAPPING = """
 format: cg_import/1
@@ -129,6 +151,21 @@ FACTS = json.dumps({
     'format': 'cg_diagnosis/1', 'verdict': 'explained', 'summary': 'payload', 'findings': [],
     'gain': {'hip_angle': {'before': 1.0, 'after': 0.1, 'unit': 'rad'}}, 'causes': [{'a': None}],
 })  # fmt: skip
+ZERO = """
+format: cg_zero/1
+zero_rad: 0.0123
+axis: pitch
+sign: -1.0
+still_rad: 0.0004
+samples: 250
+taken_at: '2026-03-04T10:12:00Z'
+taken_by: somebody
+"""
+SELECTION = json.dumps({'path': '/a/b/tree.npz', 'sha256': '0' * 64})
+KEPT = json.dumps({
+    'theta': [1.0, 2.0], 'motions': [[0.1, 0.2], [0.3]], 'cost': 1.5, 'sse': [[1.0], [2.0]],
+    'count': [[100.0], [100.0]], 'weight': 1.0, 'converged': True,
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -139,22 +176,75 @@ class Reader:
         read: Reads the file of that path.
         name: Name of the file.
         seeds: Sound contents.
-        share: Of all mutants, in parts.
+        kind: 'text', 'binary' or 'archive': which mutations make sense.
+        around: Name -> content of files that must stand beside it.
     """
 
     read: Callable[[Path], object]
     name: str
-    seeds: tuple[str, ...]
-    share: int = 1
+    seeds: tuple[bytes, ...]
+    kind: str = 'text'
+    around: dict[str, bytes] = field(default_factory=dict)
 
 
-def _texts(folder: Path) -> tuple[str, ...]:
-    return tuple(path.read_text('utf-8') for path in sorted(folder.glob('*.yaml')))
+def _utf8(*texts: str) -> tuple[bytes, ...]:
+    return tuple(text.encode() for text in texts)
 
 
-def _full_model() -> str:
+def _files(folder: Path) -> tuple[bytes, ...]:
+    return tuple(path.read_bytes() for path in sorted(folder.glob('*.yaml')))
+
+
+def _full_model() -> bytes:
     model = Model.load(model_path('sydney_pendulum'))
-    return model.with_effect('backlash').with_effect('payload').text()
+    return model.with_effect('backlash').with_effect('payload').text().encode()
+
+
+def _bag() -> dict[str, bytes]:
+    """Name -> content of the files of a small bag."""
+    stamps = 1_300_000_000_000_000_000 + 2_000_000 * np.arange(6)
+    swing = np.linspace(0.0, 0.1, 6)
+    note = {'nominal_rate_hz': 500.0, 'experiment': 'free swing'}
+    record = Record(
+        'bag', stamps, {'torque': 0.0 * swing}, {'angle': swing}, 'pendulum', Setup(), note
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        bag = write_bag(Path(folder) / 'bag', record)
+        return {path.name: path.read_bytes() for path in bag.iterdir()}
+
+
+def _mat_files() -> Iterator[bytes]:
+    """A log in each form of MAT that is read."""
+    time_s = np.linspace(0.0, 0.5, 6)
+    log = {'t': time_s, 'run': {'angle': np.sin(time_s), 'name': 'first'}, 'rate_hz': 10.0}
+    flat = {'t': time_s, 'angle': np.arange(6.0)}
+    for form, compressed, content in (('5', False, log), ('5', True, log), ('4', False, flat)):
+        file = io.BytesIO()
+        scipy.io.savemat(file, content, format=form, do_compression=compressed)
+        yield file.getvalue()
+
+
+def _tree() -> bytes:
+    """A tree of a few nodes: a motion of two knots, along which everything is constant."""
+    model = Model.load(model_path('compass_gait_mit'))
+    content = json.loads(TRAJECTORY)
+    content['model_hash'] = model.hash
+    nodes = Nodes.of(Trajectory.from_text(json.dumps(content), model), model)
+    goal = np.array([np.full((4, 4), np.nan), 25.0 * np.eye(4)])
+    tree = Tree(nodes, goal, {'seed': 3}, np.array([[nodes.first, -1], [-1, -1]]))
+    return _written(tree.save, 'tree.npz')
+
+
+def _curves() -> bytes:
+    time_s = np.linspace(0.0, 1.0, 5)
+    row = curves.Curve('a', 'train', time_s, *[time_s[:, None]] * (len(curves.SIGNALS) - 1))
+    return _written(lambda path: curves.save([row], path.parent), curves.FILE_NAME)
+
+
+def _written(write: Callable[[Path], object], name: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
 
 
 def _read_mapping(path: Path) -> None:
@@ -168,36 +258,52 @@ def _read_note(path: Path) -> None:
     Setup.from_dict(load_note(path).get('setup') or {})
 
 
-def _read_facts(path: Path) -> None:
-    read_facts(path.parent)
-
-
 def _read_basins(path: Path) -> None:
     SHIPPED.of(parse_yaml(read_text(path), path.name), path.name)
 
 
 def readers() -> dict[str, Reader]:
     """All readers by name."""
-    basins, hidden = shipped_file(), hidden_effects_file()
+    basins, hidden = shipped_file().read_bytes(), hidden_effects_file().read_bytes()
+    commands = '# a\ntime,torque\n0.0,1.0\n0.5,-2.0\n'
+    logs = '{"t": [0, 0.1, null], "q": [1, 2, 3]}', '{"entries": [{"t": 0, "q": 1.5}]}'
+    bag = _bag()
+    metadata, recorded = bag['metadata.yaml'], bag['bag.mcap']
     return {
-        'model': Reader(Model.load, 'a.yaml', (*_texts(models_directory()), _full_model()), 3),
-        'mapping': Reader(_read_mapping, 'a.yaml', (*[MAPPING] * 6, *_texts(mapping_folder())), 3),
-        'trajectory': Reader(Trajectory.load, 'a.json', (TRAJECTORY,), 4),
-        'note': Reader(_read_note, 'a.yaml', (NOTE,), 3),
-        'setup': Reader(lambda path: read_setup(str(path)), 'a.yaml', (SETUP,), 2),
+        'model': Reader(Model.load, 'a.yaml', (*_files(models_directory()), _full_model())),
+        'mapping': Reader(
+            _read_mapping, 'a.yaml', (*_utf8(*[MAPPING] * 6), *_files(mapping_folder()))
+        ),
+        'trajectory': Reader(Trajectory.load, 'a.json', _utf8(TRAJECTORY)),
+        'note': Reader(_read_note, 'a.yaml', _utf8(NOTE)),
+        'setup': Reader(lambda path: read_setup(str(path)), 'a.yaml', _utf8(SETUP)),
         'experiment': Reader(
-            lambda path: load_experiment(str(path)), 'a.yaml', _texts(experiments_directory()), 2
+            lambda path: load_experiment(str(path)), 'a.yaml', _files(experiments_directory()),
+            around={p.name: p.read_bytes() for p in experiments_directory().glob('*.csv')},
         ),
-        'results': Reader(_read_facts, 'diagnosis.json', (FACTS,), 1),
-        'settings': Reader(
-            _read_basins, 'a.yaml', (basins.read_text('utf-8'), hidden.read_text('utf-8')), 1
+        'results': Reader(lambda path: read_facts(path.parent), 'diagnosis.json', _utf8(FACTS)),
+        'settings': Reader(_read_basins, 'a.yaml', (basins, hidden)),
+        'zero file': Reader(lambda path: read_zero(str(path)), 'a.yaml', _utf8(ZERO)),
+        'selected tree': Reader(
+            lambda path: TreeSelection.from_text(read_text(path)), 'a.json', _utf8(SELECTION)
         ),
-        'log (CSV)': Reader(read_table, 'a.csv', (LOG,), 2),
-        'log (JSON)': Reader(
-            read_table, 'a.json',
-            ('{"t": [0, 0.1, null], "q": [1, 2, 3]}', '{"entries": [{"t": 0, "q": 1.5}]}'), 2,
+        'kept fit': Reader(lambda path: _End.of(recall(path)), 'a.json', _utf8(KEPT)),
+        'log (CSV)': Reader(read_table, 'a.csv', _utf8(LOG)),
+        'log (JSON)': Reader(read_table, 'a.json', _utf8(*logs)),
+        'log (MAT)': Reader(read_table, 'a.mat', tuple(_mat_files()), 'binary'),
+        'command file': Reader(playback, 'a.csv', _utf8(commands)),
+        'tree': Reader(Tree.load, 'a.npz', (_tree(),), 'archive'),
+        'curves': Reader(
+            lambda path: curves.load(path.parent), curves.FILE_NAME, (_curves(),), 'archive'
         ),
-        'command file': Reader(playback, 'a.csv', ('# a\ntime,torque\n0.0,1.0\n0.5,-2.0\n',), 1),
+        'bag: metadata': Reader(
+            lambda path: read_bag(path.parent), 'metadata.yaml', (metadata,),
+            around={'bag.mcap': recorded},
+        ),
+        'bag: MCAP': Reader(
+            lambda path: read_bag(path.parent), 'bag.mcap', (recorded,), 'binary',
+            around={'metadata.yaml': metadata},
+        ),
     }  # fmt: skip
 
 
@@ -221,7 +327,7 @@ ODD_VALUES = (
 WORD = re.compile(rb'[\w.+-]+|[^\w\s]|\s+')
 
 
-def flip_bytes(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+def flip_bytes(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """A few bytes changed, inserted, taken out or doubled."""
     out = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
@@ -242,7 +348,7 @@ def flip_bytes(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes
     return bytes(out)
 
 
-def swap_words(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+def swap_words(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """A few words swapped for odd ones, taken out, doubled or exchanged."""
     words = list(_words(data))
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
@@ -259,7 +365,7 @@ def swap_words(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes
     return b''.join(words)
 
 
-def swap_entries(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+def swap_entries(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """The content with entries swapped for odd values, deleted, renamed, doubled or wrapped."""
     text = _as_json(data)
     if text is None:
@@ -307,9 +413,9 @@ def _places(tree: object) -> Iterator[tuple]:
             yield from _places(tree[key])
 
 
-def splice(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+def splice(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """The head of one file and the tail of another."""
-    other = rng.choice(seeds).encode()
+    other = rng.choice(seeds)
     return data[: rng.randrange(len(data) + 1)] + other[rng.randrange(len(other) + 1) :]
 
 
@@ -370,7 +476,7 @@ FUSES: tuple[Callable[[int], str], ...] = (
 )
 
 
-def bomb(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
+def bomb(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """Something that swells or nests, in place of a word or of the whole."""
     n = rng.choice((100, 1500, 1500, 20_000)) if rng.random() < 0.98 else 300_000
     fuse = rng.choice(FUSES)(n)
@@ -381,15 +487,82 @@ def bomb(data: bytes, rng: random.Random, seeds: tuple[str, ...]) -> bytes:
     return b''.join(words)
 
 
-MUTATIONS = (flip_bytes, swap_words, swap_entries, splice, bomb)
-WEIGHTS = (30, 30, 30, 8, 2)
+ODD_NUMBERS = tuple(
+    struct.pack(form, value)
+    for form, values in (
+        ('<d', (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, 5e-324)),
+        ('<q', (-1, 0, 1, 2**31, 2**62, -(2**63))),
+        ('<i', (-1, 0, 1, 2**30, 2**31 - 1, -(2**31))),
+        ('<H', (0, 1, 0xFFFF)),
+    )
+    for value in values
+)
+HEADER = 'header.npy'
+
+
+def swap_numbers(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
+    """A few odd numbers where some others were: lengths, counts, offsets, values."""
+    out = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        number = rng.choice(ODD_NUMBERS)
+        k = rng.randrange(max(1, len(out) - len(number)))
+        if rng.random() < 0.7:
+            k -= k % len(number)
+        out[k : k + len(number)] = number
+    return bytes(out)
+
+
+def change_inside(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
+    """An archive of arrays of which some are changed, missing or exchanged."""
+    arrays = dict(_arrays(data))
+    for _ in range(rng.choice((1, 1, 1, 2))):
+        name, other = rng.choice(list(arrays)), rng.choice(list(arrays))
+        kind = rng.randrange(8)
+        if name == HEADER and kind < 6:
+            text = np.load(io.BytesIO(arrays[HEADER])).tobytes()
+            text = rng.choice((swap_entries, swap_entries, swap_words, bomb))(text, rng, (text,))
+            file = io.BytesIO()
+            np.save(file, np.frombuffer(text, np.uint8))
+            arrays[HEADER] = file.getvalue()
+        elif kind < 2:
+            arrays[name] = swap_numbers(arrays[name], rng, seeds)
+        elif kind < 4:
+            arrays[name] = arrays[name][:128] + swap_numbers(arrays[name][128:], rng, seeds)
+        elif kind == 4:
+            arrays[name] = swap_words(arrays[name], rng, seeds)
+        elif kind == 5:
+            arrays[name] = flip_bytes(arrays[name], rng, seeds)
+        elif kind == 6:
+            arrays[name], arrays[other] = arrays[other], arrays[name]
+        elif len(arrays) > 1:
+            del arrays[name]
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, 'w') as archive:
+        for name, content in arrays.items():
+            archive.writestr(zipfile.ZipInfo(name), content)
+    return file.getvalue()
+
+
+@functools.cache
+def _arrays(data: bytes) -> tuple[tuple[str, bytes], ...]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return tuple((name, archive.read(name)) for name in archive.namelist())
+
+
+# Kind of file -> mutations and how often.
+MUTATIONS = {
+    'text': ((flip_bytes, swap_words, swap_entries, splice, bomb), (30, 30, 30, 8, 2)),
+    'binary': ((flip_bytes, swap_numbers, splice, bomb), (45, 45, 8, 2)),
+    'archive': ((change_inside, flip_bytes, swap_numbers, bomb), (80, 9, 9, 2)),
+}
 
 
 def mutant(name: str, reader: Reader, number: int) -> bytes:
     """The mutant of that number."""
     rng = random.Random(f'{name} {number}')
-    data = rng.choice(reader.seeds).encode()
-    (change,) = rng.choices(MUTATIONS, WEIGHTS)
+    data = rng.choice(reader.seeds)
+    changes, weights = MUTATIONS[reader.kind]
+    (change,) = rng.choices(changes, weights)
     return change(data, rng, reader.seeds)
 
 
@@ -419,9 +592,20 @@ def complaint(error: Exception) -> str:
     return ''
 
 
-def judge(name: str, reader: Reader, numbers: range, folder: Path) -> Tally:
-    """Read the mutants of these numbers."""
+def judge(
+    name: str, reader: Reader, numbers: range, folder: Path, seconds: float = math.inf
+) -> Tally:
+    """Read the mutants of these numbers, or those of them that a slow reader takes in time.
+
+    Args:
+        name: Of the reader, from which its mutants follow.
+        reader: The reader.
+        numbers: Of the mutants.
+        folder: Empty but for what the reader needs.
+        seconds: CPU time after which a slow reader ends.
+    """
     tally, path = Tally(), folder / reader.name
+    start = time.process_time()
     for number in numbers:
         path.write_bytes(mutant(name, reader, number))
         began = time.process_time()
@@ -435,11 +619,14 @@ def judge(name: str, reader: Reader, numbers: range, folder: Path) -> Tally:
                 place = f'{Path(last.filename).name}:{last.lineno}'
                 line = f'{name} {number}: {type(error).__name__} at {place}: {str(error)[:200]!r}'
                 (tally.crashes if fault == 'crash' else tally.unclear).append(line)
-        spent = time.process_time() - began
+        ended = time.process_time()
+        spent = ended - began
+        tally.inputs += 1
         tally.cpu_s += spent
         if spent > tally.longest_s:
             tally.longest_s, tally.longest = spent, number
-    tally.inputs = len(numbers)
+        if ended - start > max(seconds, SLOW_S * tally.inputs):
+            break
     return tally
 
 
@@ -448,29 +635,41 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def run(inputs: int, only: list[str] | None = None) -> Iterator[tuple[str, Tally, float]]:
+def place_around(reader: Reader, folder: Path) -> None:
+    """Put what a reader needs beside its file."""
+    for name, content in reader.around.items():
+        (folder / name).write_bytes(content)
+
+
+def run(
+    inputs: int, only: list[str] | None = None, seconds: float = math.inf
+) -> Iterator[tuple[str, Tally, float]]:
     """Reader, its tally and the growth of the largest memory in MB, for each reader."""
     known = readers()
-    chosen = {name: known[name] for name in only or known}
-    parts = sum(reader.share for reader in chosen.values())
     shared = Path('/dev/shm')
     with tempfile.TemporaryDirectory(dir=shared if shared.is_dir() else None) as folder:
-        for name, reader in chosen.items():
-            here = Path(folder) / name
+        for name in only or known:
+            reader, here = known[name], Path(folder) / 'bag'
             here.mkdir()
+            place_around(reader, here)
             for seed in reader.seeds:
                 if name != 'settings':  # its two kinds of files exclude each other
-                    (here / reader.name).write_text(seed, 'utf-8')
-                    if name != 'mapping' or seed is MAPPING:  # the logs of the others are not here
+                    (here / reader.name).write_bytes(seed)
+                    # The logs of the other mappings are not here.
+                    if name != 'mapping' or seed == MAPPING.encode():
                         reader.read(here / reader.name)
             before = memory_mb()
-            tally = judge(name, reader, range(inputs * reader.share // parts), here)
+            tally = judge(name, reader, range(inputs), here, seconds)
             yield name, tally, memory_mb() - before
+            shutil.rmtree(here)
 
 
 def main() -> int:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument('--inputs', type=int, default=1_000_000)
+    options.add_argument('--inputs', type=int, default=1_000_000, help='of each reader [10^6]')
+    options.add_argument(
+        '--seconds', type=float, default=300.0, help='of CPU for a slow reader [300]'
+    )
     options.add_argument('--readers', nargs='+', choices=readers(), metavar='READER')
     options.add_argument('--replay', nargs=2, metavar=('READER', 'NUMBER'), help='show a mutant')
     options.add_argument('--write', type=Path, metavar='FILE', help='write the table there')
@@ -479,16 +678,19 @@ def main() -> int:
         name, number = given.replay[0], int(given.replay[1])
         sys.stdout.buffer.write(mutant(name, readers()[name], number))
         return 0
+    only = [f'--readers {" ".join(map(repr, given.readers))}'] if given.readers else []
+    command = ['python bench/fuzz_readers.py', f'--inputs {given.inputs}',
+               f'--seconds {given.seconds:g}', *only]  # fmt: skip
     lines = [
         '# Mutated files', '',
-        f'Command: `python bench/fuzz_readers.py --inputs {given.inputs}`. What mutants, crashes '
-        'and unclear errors are is said at the top of the script.', '',
+        f'Command: `{" ".join(command)}`. What mutants, crashes and unclear errors are is said '
+        'at the top of the script, and why some readers got fewer mutants.', '',
         '| reader | mutants | taken | crashes | unclear errors | longest, s CPU | CPU, s | '
         'memory grew by, MB |',
         '|---|---:|---:|---:|---:|---:|---:|---:|',
     ]  # fmt: skip
     bad, total = 0, Tally()
-    for name, tally, grown in run(given.inputs, given.readers):
+    for name, tally, grown in run(given.inputs, given.readers, given.seconds):
         for line in (*tally.crashes, *tally.unclear)[:20]:
             print(line, file=sys.stderr)
         bad += len(tally.crashes) + len(tally.unclear)

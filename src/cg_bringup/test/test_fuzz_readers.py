@@ -20,6 +20,7 @@ READERS = fuzz.readers()
 @pytest.mark.parametrize('name', READERS)
 def test_mutants_are_taken_or_refused(name, tmp_path):
     before = fuzz.memory_mb()
+    fuzz.place_around(READERS[name], tmp_path)
     tally = fuzz.judge(name, READERS[name], range(400), tmp_path)
     assert tally.crashes == []
     assert tally.unclear == []
@@ -33,7 +34,7 @@ def test_bombs_do_not_go_off(fuse, tmp_path):
     text = fuzz.FUSES[fuse](30_000)
     for reader in ('model', 'trajectory', 'log (CSV)'):
         path = tmp_path / READERS[reader].name
-        for seed in ('', READERS[reader].seeds[0].replace('2', text, 1)):
+        for seed in ('', READERS[reader].seeds[0].decode().replace('2', text, 1)):
             path.write_text(seed or text)
             began, before = fuzz.time.process_time(), fuzz.memory_mb()
             with contextlib.suppress(*fuzz.OURS):

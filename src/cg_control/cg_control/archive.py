@@ -73,6 +73,7 @@ def _unpacked(
     path: Path, names: tuple[str, ...], what: str, largest: int, error: type[Exception]
 ) -> dict[str, np.ndarray]:
     """The arrays of a file, each of them plain, none of them too large."""
+    place = 'the archive'
     try:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename: info for info in archive.infolist()}
@@ -82,14 +83,24 @@ def _unpacked(
             size = sum(members[f'{name}.npy'].file_size for name in names)
             if size > largest:
                 raise error(f'{size} bytes unpacked; allowed are {largest}')
-            return {name: _array(archive.read(f'{name}.npy')) for name in names}
+            found = {}
+            for name in names:
+                place = name
+                found[name] = _array(archive.read(f'{name}.npy'))
+            return found
     except OSError as problem:
-        raise error(problem.strerror or str(problem)) from None
+        raise error(problem.strerror or 'cannot be read') from None
     except error:
         raise
+    except TooLarge as problem:
+        raise error(f'not {what}, or damaged: {place} is {problem}') from None
     # Whatever a damaged archive makes zipfile, zlib or numpy raise.
-    except Exception as problem:
-        raise error(f'not {what}, or damaged: {problem}') from None
+    except Exception:
+        raise error(f'not {what}, or damaged: {place} is none that can be read') from None
+
+
+class TooLarge(ValueError):
+    """An array that declares more than it holds."""
 
 
 def _array(content: bytes) -> np.ndarray:
@@ -100,6 +111,6 @@ def _array(content: bytes) -> np.ndarray:
     read = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}
     shape, _, dtype = read[version](file)
     if math.prod(shape) * dtype.itemsize > len(content):
-        raise ValueError(f'an array of shape {shape} in {len(content)} bytes')
+        raise TooLarge(f'an array of shape {shape} in {len(content)} bytes')
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)

@@ -177,7 +177,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused(robot, file):
     with zipfile.ZipFile(file, 'w') as archive:
         for name, content in {**members, 'rho.npy': header.getvalue()}.items():
             archive.writestr(name, content)
-    with pytest.raises(TreeError, match=r'damaged: an array of shape \(1099511627776,\)'):
+    with pytest.raises(TreeError, match=r'damaged: rho is an array of shape \(1099511627776,\)'):
         Checkpoint.load(file, robot)
 
 

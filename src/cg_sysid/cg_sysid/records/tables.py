@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 
 from cg_description.reading import JSON_LOG, parse_json, read_text, shown
 from cg_description.schema import ListOf, Number, meant
 from cg_sysid.errors import RecordingError
+from cg_sysid.records.mat_file import MOST, MatError, vectors
 
 
 class Table(dict[str, np.ndarray]):
@@ -142,24 +142,12 @@ def _read_csv(path: Path) -> Table:
 
 def _read_mat(path: Path) -> Table:
     try:
-        content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
-    except Exception as error:  # scipy has none of its own: whatever its decoder stumbles over
-        reason = ' '.join(str(error).split())[:200]
-        raise RecordingError(f'{path}: not a readable MAT file: {reason}') from None
-    columns: dict[str, np.ndarray] = {}
-    for name, value in content.items():
-        if not name.startswith('__'):
-            _collect(name, value, columns)
-    return _same_length(columns)
-
-
-def _collect(name: str, value: object, columns: dict[str, np.ndarray]) -> None:
-    """Take the vectors out of a MATLAB variable, into structs as deep as they go."""
-    if hasattr(value, '_fieldnames'):
-        for field in value._fieldnames:
-            _collect(f'{name}.{field}', getattr(value, field), columns)
-    elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in 'biuf':
-        columns[name] = value.astype(float)
+        with path.open('rb') as file:
+            return _same_length(vectors(file.read(MOST + 1)))
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from None
+    except MatError as error:
+        raise RecordingError(f'{path}: not a readable MAT file: {error}') from None
 
 
 def _read_json(path: Path) -> Table:

@@ -23,6 +23,11 @@ from cg_sysid.identification.identify import in_data_set
 
 FILE_NAME = 'curves.npz'
 FORMAT = 'cg_curves/1'
+LARGEST = 1 << 28  # bytes, unpacked
+
+
+class CurvesError(ValueError):
+    """A file of curves that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -139,21 +144,45 @@ def load(directory: str | Path) -> tuple[list[Curve], list[FaultSignal]]:
     """Read curves.npz; empty lists where there is none.
 
     Raises:
-        ValueError: The file is not of this format.
+        CurvesError: The file is not of this format, damaged or too large.
     """
     path = Path(directory) / FILE_NAME
     if not path.is_file():
         return [], []
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            if str(arrays['format']) != FORMAT:
-                raise ValueError(f'format is {arrays["format"]}, expected {FORMAT}')
+            _require_size(path, arrays)
+            if arrays['format'].tolist() != FORMAT:
+                raise CurvesError(f'{path}: not a file of curves: format must be {FORMAT}')
+            names, roles = (arrays[key].tolist() for key in ('names', 'roles'))
             found = [
                 Curve(str(name), str(role), *(arrays[f'{k}/{signal}'] for signal in SIGNALS))
-                for k, (name, role) in enumerate(
-                    zip(arrays['names'], arrays['roles'], strict=True)
-                )
+                for k, (name, role) in enumerate(zip(names, roles, strict=True))
             ]
-            return found, from_arrays(arrays)
-    except Exception as error:  # zipfile and zlib have their own kinds
-        raise ValueError(f'{path}: not a file of curves: {error}') from None
+            faults = from_arrays(arrays)
+    except CurvesError:
+        raise
+    except Exception:  # zipfile, zlib and numpy have their own kinds
+        raise CurvesError(f'{path}: not a file of curves, or damaged') from None
+    for curve in found:
+        _require_rows(path, curve)
+    return found, faults
+
+
+def _require_size(path: Path, arrays: Any) -> None:
+    unpacked = sum(member.file_size for member in arrays.zip.infolist())
+    if unpacked > LARGEST:
+        raise CurvesError(f'{path}: unpacks to {unpacked} bytes; allowed are {LARGEST}')
+
+
+def _require_rows(path: Path, curve: Curve) -> None:
+    """A curve that can be drawn."""
+    for signal in SIGNALS:
+        array, dimensions = getattr(curve, signal), 1 if signal == 'time' else 2
+        if not isinstance(array, np.ndarray):
+            raise CurvesError(f'{path}: {curve.name!r}: {signal} is no array')
+        if array.dtype.kind != 'f' or array.ndim != dimensions or len(array) != len(curve.time):
+            raise CurvesError(
+                f'{path}: {curve.name!r}: {signal} must hold numbers, {dimensions}-dimensional, '
+                'one row for each time'
+            )
