@@ -262,6 +262,11 @@ def _read_basins(path: Path) -> None:
     SHIPPED.of(parse_yaml(read_text(path), path.name), path.name)
 
 
+def _read_kept(path: Path) -> None:
+    if _End.of(recall(path)) is None:
+        raise DocumentError(f'{path}: nothing that is known')
+
+
 def readers() -> dict[str, Reader]:
     """All readers by name."""
     basins, hidden = shipped_file().read_bytes(), hidden_effects_file().read_bytes()
@@ -287,7 +292,7 @@ def readers() -> dict[str, Reader]:
         'selected tree': Reader(
             lambda path: TreeSelection.from_text(read_text(path)), 'a.json', _utf8(SELECTION)
         ),
-        'kept fit': Reader(lambda path: _End.of(recall(path)), 'a.json', _utf8(KEPT)),
+        'kept fit': Reader(_read_kept, 'a.json', _utf8(KEPT)),
         'log (CSV)': Reader(read_table, 'a.csv', _utf8(LOG)),
         'log (JSON)': Reader(read_table, 'a.json', _utf8(*logs)),
         'log (MAT)': Reader(read_table, 'a.mat', tuple(_mat_files()), 'binary'),
