@@ -4,53 +4,20 @@
 looked through first, within the limits of interfaces.md.
 """
 
-import re
 import sqlite3
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import zstandard
 
-from cg_description.reading import Limits, parse_yaml, path_below, read_text, shown
-from cg_description.schema import Flag, Key, ListOf, Mapping, Number, Text, Whole
+from cg_description.reading import parse_yaml
 from cg_sysid.errors import RecordingError
+from cg_sysid.records.bag_metadata import compression_mode
 from cg_sysid.records.mcap_records import LARGEST_CHUNK, MAGIC, is_bounded_zstd
 from cg_sysid.records.mcap_scan import LARGEST_RATIO, Survey, messages, survey
 from cg_sysid.records.recover import METADATA, needs_recovery
 
 LOGS = ('.csv', '.mat', '.json')  # what an import is needed for
-METADATA_LIMITS = Limits(size=1024 * 1024, depth=40, nodes=25_000)
-STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}  # storage plugin -> ending of its files
 STEP = 1024 * 1024
-MODES = ('', 'none', 'file', 'message', 'NONE', 'FILE', 'MESSAGE')
-ROS_NAME = Text(longest=255)
-POLICIES = ('history', 'reliability', 'durability', 'liveliness')
-TOPIC = Mapping({
-    name: Key(ROS_NAME) for name in ('name', 'type', 'serialization_format')
-}, further=True)  # fmt: skip
-QOS = ListOf(Mapping({
-    **{name: Key(Text(), default='unknown') for name in POLICIES},
-    **{name: Key(Mapping({'sec': Key(Number()), 'nsec': Key(Number())}, further=True))
-       for name in ('deadline', 'lifespan', 'liveliness_lease_duration')},
-    'depth': Key(Whole(0)),
-    'avoid_ros_namespace_conventions': Key(Flag()),
-}, fill=False, further=True))  # fmt: skip
-# What rosbags takes without a look, for every version of the format.
-METADATA_SCHEMA = Mapping({
-    'rosbag2_bagfile_information': Key(Mapping({
-        'version': Key(Whole(1)),
-        'storage_identifier': Key(Text()),
-        'relative_file_paths': Key(ListOf(Text())),
-        'compression_format': Key(Text(), default=''),
-        'compression_mode': Key(Text(MODES), default=''),
-        'duration': Key(Mapping({'nanoseconds': Key(Number(0.0))}, further=True)),
-        'starting_time': Key(Mapping({'nanoseconds_since_epoch': Key(Number())}, further=True)),
-        'message_count': Key(Whole(0)),
-        'topics_with_message_count': Key(ListOf(Mapping({
-            'topic_metadata': Key(TOPIC), 'message_count': Key(Whole(0)),
-        }, further=True))),
-        'files': Key(ListOf(Mapping({'path': Key(Text())}, further=True)), default=()),
-    }, further=True)),
-}, further=True)  # fmt: skip
 
 
 def require_sound(path: Path) -> None:
@@ -74,7 +41,7 @@ def _require_sound(path: Path) -> None:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     packed_messages = False
     if path.is_dir():
-        packed_messages = _checked_metadata(path / METADATA) == 'message'
+        packed_messages = compression_mode(path / METADATA) == 'message'
     for file in files:
         if file.suffix == '.mcap':
             found = survey(file)
@@ -90,62 +57,6 @@ def _require_sound(path: Path) -> None:
             _require_bounded(file, _rows(file))
         elif file.suffix == '.zstd':
             _require_bounded_file(file)
-
-
-def _checked_metadata(file: Path) -> str:
-    """The mode of compression; RecordingError if nobody should read this file."""
-    tree = parse_yaml(read_text(file, RecordingError, METADATA_LIMITS), str(file), RecordingError,
-                      METADATA_LIMITS)  # fmt: skip
-    where = f'{file}: not a readable rosbag2 recording'
-    checked = METADATA_SCHEMA.of(tree, where, RecordingError)['rosbag2_bagfile_information']
-    written = tree['rosbag2_bagfile_information']
-    for key in ('compression_mode', 'files'):
-        if written.get(key, '') is None:
-            raise RecordingError(f'{where}: {key}: nothing stands there')
-    _require_own_files(file, checked)
-    for topic in written['topics_with_message_count']:
-        _require_topic(topic['topic_metadata'], where)
-    return checked['compression_mode'].lower()
-
-
-def _require_topic(topic: dict, where: str) -> None:
-    """Names that can be shown, and policies that are policies for the YAML of rosbags too."""
-    for key in ('name', 'type'):
-        if not isinstance(topic[key], str) or not topic[key].isprintable():
-            raise RecordingError(f'{where}: {shown(topic[key])} is no {key} of a topic')
-    place = f'{where}: {topic["name"]}: offered_qos_profiles'
-    offered = topic.get('offered_qos_profiles')
-    if isinstance(offered, str) and offered:  # a text of YAML in older bags
-        offered = parse_yaml(offered, place, RecordingError)
-    elif not offered:
-        return
-    QOS.of(offered, place, RecordingError)
-    for profile in offered:
-        for policy in POLICIES:
-            given = profile.get(policy, 'unknown')
-            if given is None or not re.fullmatch('[A-Za-z_]+|[0-9]', str(given)):
-                raise RecordingError(f'{place}: {policy}: {shown(given)} is none')
-
-
-def _require_own_files(metadata: Path, information: dict) -> None:
-    """Every file that is named must be one that was looked through."""
-    suffix = STORAGE.get(information['storage_identifier'])
-    # Before version 4 the folder's own name came first.
-    deepest = 1 if information['version'] >= 4 else 2
-    named = {
-        'relative_file_paths': information['relative_file_paths'],
-        'files': [entry['path'] for entry in information['files']],
-    }
-    for key, names in named.items():
-        for name in names:
-            place = f'{metadata}: {key}'
-            path_below(metadata.parent, name, place, RecordingError)
-            own = len(PurePath(name).parts) <= deepest
-            if not own or (suffix and not name.removesuffix('.zstd').endswith(suffix)):
-                raise RecordingError(
-                    f'{place}: {shown(name)} is no storage file of this bag; the name of one '
-                    f'in its folder is needed, such as {metadata.parent.name}_0{suffix or ""}'
-                )
 
 
 def _rows(file: Path):
