@@ -146,7 +146,7 @@ def test_the_model_says_what_a_bag_does_not(swing, tmp_path, capsys):
     model.write_text(FILE)
     bags = [
         write(tmp_path / 'silent', swing, note=None),
-        write(tmp_path / 'named', swing, note={**NOTE, 'mechanism': 'urdf'}),
+        write(tmp_path / 'named', swing, note={**NOTE, 'mechanism': 'two_joint_arm'}),
     ]
     assert main(['--model', str(model), *map(str, bags)]) == 0
     assert main([str(bags[0])]) == 1
@@ -160,11 +160,11 @@ def test_a_robot_of_no_table_needs_its_model(tmp_path, monkeypatch):
         install(known)
         record = rehearse('rest', arm(), Setup(), [0.0] * 4, [lambda t: 0.0], 0.1)
     path = write_bag(tmp_path / 'bag', record)
-    with pytest.raises(RecordingError, match="unknown mechanism 'urdf'"):
+    with pytest.raises(RecordingError, match="unknown mechanism 'two_joint_arm'"):
         read_bag(path)
     assert read_bag(path, mechanism=ARM).mechanism == ARM
     pendulum = channels.mechanism('pendulum')
-    with pytest.raises(RecordingError, match="unknown mechanism 'urdf'"):
+    with pytest.raises(RecordingError, match="unknown mechanism 'two_joint_arm'"):
         read_bag(path, mechanism=pendulum)
 
 
@@ -174,7 +174,7 @@ def test_a_bag_that_names_another_robot_is_refused(swing, tmp_path):
     note = {**NOTE, 'mechanism': 'pendulum'}
     path = write(tmp_path / 'bag', swing, note=note, names=('gripper', 'elbow', 'joint'))
     with pytest.raises(
-        ValueError, match="recorded on a pendulum, but the model 'arm' is of a urdf"
+        ValueError, match="recorded on a pendulum, but the model 'arm' is of a two_joint"
     ):
         load_bags([path], model)
 

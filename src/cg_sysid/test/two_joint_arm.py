@@ -9,7 +9,7 @@ from cg_interfaces import channels
 class TwoJointArm(DoublePendulum):
     """The physics of a double pendulum, channels as of a robot that a URDF describes."""
 
-    name = 'urdf'
+    name = 'two_joint_arm'
     coordinates = ('shoulder', 'elbow')
     joints = {'shoulder': (1.0, 0.0)}  # noqa: RUF012 - read only
     inputs = ('shoulder_effort',)
@@ -30,7 +30,7 @@ class TwoJointArm(DoublePendulum):
 FILE = """\
 format: cg_model/1
 name: arm
-mechanism: urdf
+mechanism: two_joint_arm
 parameters:
   upper_inertia: {value: 0.06, unit: kg m^2}
   lower_inertia: {value: 0.02, unit: kg m^2}
@@ -56,7 +56,7 @@ ARM = channels.interface(TwoJointArm())
 
 def install(monkeypatch) -> None:
     """Make the mechanism one that model files may name."""
-    monkeypatch.setitem(MECHANISMS, 'urdf', TwoJointArm())
+    monkeypatch.setitem(MECHANISMS, TwoJointArm.name, TwoJointArm())
 
 
 def arm() -> Model:
