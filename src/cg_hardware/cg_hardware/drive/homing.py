@@ -90,6 +90,8 @@ class Homing(Procedure):
         self.index = 0
 
     def _wrong(self, seen: Seen, emergency: str) -> str:
+        if seen.state is None:
+            return 'the drive is silent'
         if self._fit and seen.state in FAULTS:
             return emergency or seen.state.value
         if seen.state == State.QUICK_STOP:

@@ -1,7 +1,8 @@
 """The index of the encoder, while a person turns the joint (CiA 402, touch probe). No ROS.
 
 The drive holds no torque. It latches the counts at the rising edge of the encoder's index, however
-fast that goes by, and the host reads them when they are there.
+fast that goes by, and the host reads them when they are there. As nothing acts, a drive that says
+nothing for some cycles, or is in a fault, does not end it; one that answers no transfer does.
 """
 
 from cg_hardware.drive import cia402

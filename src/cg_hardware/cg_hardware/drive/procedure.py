@@ -122,8 +122,7 @@ class Procedure(ABC):
         self.tidy = True
 
     def _wrong(self, seen: Seen, emergency: str) -> str:
-        if seen.state is None:
-            return 'the drive is silent'
+        """Why it must end now; empty if it may go on."""
         if self.clock() > self._ends_at:
             return f'not done within {self.time_limit:g} s'
         return ''
