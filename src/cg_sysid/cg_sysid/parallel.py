@@ -180,8 +180,8 @@ def stop() -> None:
     pool, _pool = _pool, None
     processes = list((pool._processes or {}).values())
     # Work that nobody will take from a full pipe would hold this process when it wants to end.
-    if pool._call_queue is not None:
-        pool._call_queue.cancel_join_thread()
+    if (queue := getattr(pool, '_call_queue', None)) is not None:
+        queue.cancel_join_thread()
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()
