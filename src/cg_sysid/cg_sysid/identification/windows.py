@@ -33,6 +33,7 @@ from cg_sysid.records.record import Record
 # A model that is right to one per cent, which is as right as an identified one is, is wrong by the
 # whole of the motion where errors have grown by so much.
 FOLLOWED = 100.0
+LEAST_FOLLOWED = 5.0  # growth over which any record is followed that holds a motion at all
 SHORTEST_WINDOW = 0.5  # s; less holds no motion to compare
 PIECE_S = 0.1  # of which sensitivities are chained; a measured start carries as far anywhere
 FEWEST_AT_START = 3  # samples of some channel from which a start is measured
@@ -107,13 +108,21 @@ def followed(model: Model, records: Sequence[Record]) -> tuple[Followed, ...]:
     """How far each record is followed along a model; to its end if the model cannot say.
 
     Of a robot of a URDF the model is one that its torques agree with (torque_error.py): friction
-    that the file does not know would hold the motion, or let it go.
+    that the file does not know would hold the motion, or let it go. And what share of the torques
+    it leaves is how wrong it is: errors may grow by the inverse of that.
     """
     data_sets = prepare(model, records) if records else []
-    if data_sets and torque_error.can(model):
-        found = torque_error.fit_by_torque(model, data_sets)
-        model = model.with_values(found.values) if found else model
-    return tuple(_followed(model, data_set) for data_set in data_sets)
+    most = FOLLOWED
+    found = (
+        torque_error.fit_by_torque(model, data_sets)
+        if data_sets and torque_error.can(model)
+        else None
+    )
+    if found is not None:
+        model = model.with_values(found.values)
+        wrong = float(np.nanmax(found.relative, initial=0.0))
+        most = float(np.clip(1 / max(wrong, 1e-12), LEAST_FOLLOWED, FOLLOWED))
+    return tuple(_followed(model, data_set, most) for data_set in data_sets)
 
 
 def windows_of(record: Record, found: Followed) -> list[Record]:
@@ -124,7 +133,7 @@ def windows_of(record: Record, found: Followed) -> list[Record]:
     return [record.slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
-def _followed(model: Model, data_set: DataSet) -> Followed:
+def _followed(model: Model, data_set: DataSet, most: float = FOLLOWED) -> Followed:
     try:
         begins, maps = sensitivities(model, data_set)
     except DynamicsError:
@@ -135,7 +144,7 @@ def _followed(model: Model, data_set: DataSet) -> Followed:
         with np.errstate(over='ignore', invalid='ignore'):
             since_start, since_cut = phi @ since_start, phi @ since_cut
         largest = max(largest, _norm(since_start))
-        if _norm(since_cut) > FOLLOWED and begin - last >= SHORTEST_WINDOW:
+        if _norm(since_cut) > most and begin - last >= SHORTEST_WINDOW:
             cuts.append(float(begin))
             since_cut, last = phi, float(begin)
     if cuts and data_set.duration - cuts[-1] < SHORTEST_WINDOW:
