@@ -63,6 +63,7 @@ class TorqueFit:
         relative: That over the torque that acted there, shape (m,); NaN where nothing drives.
         cost: Sum of squared residuals over `scale`, large ones capped, and of the belief.
         rows: Number of rows.
+        scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,).
     """
 
     values: Mapping[str, float]
@@ -70,6 +71,7 @@ class TorqueFit:
     relative: np.ndarray
     cost: float
     rows: int
+    scale: np.ndarray
 
 
 def can(model: Model) -> bool:
@@ -133,6 +135,7 @@ def fit_by_torque(
     only: Sequence[str] | None = None,
     bounds: Mapping[str, float] | None = None,
     scale: np.ndarray | None = None,
+    at: Mapping[str, float] | None = None,
 ) -> TorqueFit | None:
     """Identify what the torques show of a model; None where no record can be used.
 
@@ -143,6 +146,7 @@ def fit_by_torque(
         bounds: As of `identify.fit`.
         scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,), by which
             fits are compared; by default what is left of this one.
+        at: Set out from these values (full name -> value) instead of those of the model.
     """
     plain = without_states(model)
     declared = plain.declarations
@@ -150,8 +154,8 @@ def fit_by_torque(
     problems = problems_of(plain, data_sets, unknowns)
     if not problems:
         return None
-    theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
-    prior = theta.copy()
+    prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
+    theta = np.array([u.to_coordinate((at or {}).get(u.name, u.prior)) for u in unknowns])
     tolerance = np.array([u.tolerance for u in unknowns])
     own_scale = scale is None
     residual, jacobian = evaluated(problems, unknowns, theta)
@@ -188,7 +192,7 @@ def fit_by_torque(
     with np.errstate(divide='ignore', invalid='ignore'):
         relative = np.where(acted > 0, rms / acted, np.nan)
     values = {u.name: u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)}
-    return TorqueFit(values, rms, relative, cost, len(residual))
+    return TorqueFit(values, rms, relative, cost, len(residual), scale)
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ in standard deviations of what the base leaves. D costs no fit and no compilatio
     a sensor                       of the motion that it would make of the measured one
     a delay                        of the torque by time, or of the motion
 
-What has states of its own, as a flexible drive, has no D; it is looked at on the joints of which
-the torques are worst explained. A robot of six joints has 150 candidates, and a fit of one takes
-seconds.
+Those that gain most are then fitted by torque error, at once with the numbers of the base: what
+is far from its start is far from linear. What has states of its own, as a flexible drive, has no D;
+it is looked at on the joints of which the torques are worst explained. A robot of six joints has
+150 candidates, and a fit of one takes seconds.
 """
 
 from collections.abc import Sequence
@@ -29,14 +30,15 @@ from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.torque_error import Motion, Problem
+from cg_sysid.identification.torque_error import Motion, Problem, TorqueFit
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search.candidates import starts_of
 from cg_sysid.search.nuisance import Bounds
 
 FEWEST_JOINTS = 3  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
-KEPT = 14  # candidates that are looked at, the best first
+FITTED = 30  # candidates that are fitted by torque, the best first
+KEPT = 12  # of these, that are looked at
 NEAR = 0.2  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
 STEP = 1e-4  # relative, of differences of inputs in time
@@ -47,21 +49,27 @@ class Scores:
     """What the torques say of candidates.
 
     Attributes:
-        gains: (effect, place) -> nats that it could gain; of those that have a D.
+        gains: (effect, place) -> nats that it could gain by the score; of those that have a D.
+        fitted: Of the best of these, without those of sensors and delays: nats by a torque fit.
         worst: Joints, those of which the torques are worst explained first.
     """
 
     gains: dict[tuple[str, str | None], float]
+    fitted: dict[tuple[str, str | None], float]
     worst: tuple[str, ...]
 
     def worth(self, candidates: Sequence[tuple[str, str | None]]) -> list[tuple[str, str | None]]:
         """Those to be looked at."""
-        ordered = sorted(self.gains, key=lambda c: -self.gains[c])
-        best = self.gains[ordered[0]] if ordered else 0.0
-        seen = {
+        best = max(self.gains.values(), default=0.0)
+        sensed = {
+            c for c in self.gains if _sensed(c[0]) and self.gains[c] > max(SEEN, NEAR * best)
+        }
+        ordered = sorted(self.fitted, key=lambda c: -self.fitted[c])
+        best = self.fitted[ordered[0]] if ordered else 0.0
+        seen = sensed | {
             c
             for place, c in enumerate(ordered)
-            if self.gains[c] > SEEN and (place < KEPT or self.gains[c] > NEAR * best)
+            if self.fitted[c] > SEEN and (place < KEPT or self.fitted[c] > NEAR * best)
         }
         unseen = {
             (name, at)
@@ -128,10 +136,41 @@ def scores(
             rest = left + d @ solution
             best = max(best, float(left @ left - rest @ rest) / 2)
         gains[name, at] = best
+    follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
+    by_fit = {c: _gain_by_fit(plain, c, train, bounds, fitted) for c in follow}
     noise = _noise(model, train, problems, values, by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = [name for name in model.mechanism.kinematics(train[0].setup).names]
-    return Scores(gains, tuple(free[k] for k in order))
+    return Scores(gains, by_fit, tuple(free[k] for k in order))
+
+
+def _sensed(name: str) -> bool:
+    """Whether an effect is one of sensors or of time, of which a torque fit does not know."""
+    return LIBRARY[name].place in ('sensor', 'timing')
+
+
+def _gain_by_fit(
+    model: Model,
+    candidate: tuple[str, str | None],
+    train: Sequence[DataSet],
+    bounds: Bounds,
+    base: TorqueFit,
+) -> float:
+    """Nats that a candidate gains, fitted together with the numbers of the base."""
+    name, at = candidate
+    label = LIBRARY[name](model.mechanism, at).label
+    small = any(effect.label == label for effect in model.effects)
+    without = model.without_effect(label) if small else model
+    own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
+    best = 0.0
+    for start in starts_of(name, model.mechanism):
+        extended = without.with_effect(name, at, **start)
+        found = torque_error.fit_by_torque(
+            extended, train, None, own, scale=base.scale, at=base.values
+        )
+        if found is not None:
+            best = max(best, (base.cost - found.cost) / 2)
+    return best
 
 
 def _as_predicted(

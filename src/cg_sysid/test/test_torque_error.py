@@ -1,0 +1,96 @@
+"""What torques say of a robot before anything is simulated."""
+
+import numpy as np
+import pytest
+from hanging_arm import nominal, recorded
+
+from cg_dynamics.rig import Setup
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.identify import fit
+from cg_sysid.identification.torque_error import can, fit_by_torque
+from cg_sysid.identification.windows import followed
+from cg_sysid.search.candidates import candidates_for
+from cg_sysid.search.torque_screening import SEEN, scores, worth_a_look
+
+OFF = {
+    'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
+    'viscous_friction@shank_joint.coefficient': 0.16, 'coulomb_friction@thigh_joint.torque': 0.11,
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def believed():
+    return nominal()
+
+
+def data(model, believed, seeds=(1, 2)):
+    return prepare(believed, [recorded(model, 4.0, seed) for seed in seeds])
+
+
+def test_numbers_are_found_with_no_simulation(believed):
+    true = believed.with_values(OFF)
+    found = fit_by_torque(believed, data(true, believed))
+    assert can(believed)
+    # Biased by smoothing over 0.12 s; what the bodies weigh together is what torques show.
+    for name in ('coulomb_friction@hip_joint.torque', 'viscous_friction@shank_joint.coefficient'):
+        assert found.values[name] == pytest.approx(OFF[name], rel=0.15)
+    assert (found.relative < 0.05).all()
+    wrong = fit_by_torque(believed, data(true, believed), only=())
+    assert (wrong.relative > 2 * found.relative).any()
+
+
+def test_a_fit_by_simulation_goes_on_from_there(believed):
+    true = believed.with_values(OFF)
+    found = fit(believed, data(true, believed))
+    assert found.normalised_error < 1.1
+    values = dict(zip([u.name for u in found.unknowns], found.values, strict=True))
+    for name in ('coulomb_friction@hip_joint.torque', 'viscous_friction@shank_joint.coefficient'):
+        assert values[name] == pytest.approx(OFF[name], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ('name', 'at', 'sizes'),
+    [
+        ('stribeck_friction', 'thigh_joint', {'torque': 0.3, 'stribeck_rate': 0.4}),
+        ('torque_constant', 'shank_joint', {'error': 0.3}),
+        pytest.param('torque_bias', 'hip_joint', {'bias': 0.4}, marks=pytest.mark.evidence),
+        pytest.param('cogging_torque', 'thigh_joint', {'cosine': 0.3}, marks=pytest.mark.evidence),
+        ('payload', 'shank', {'mass': 0.5, 'x': 0.05, 'y': 0.06, 'z': -0.2}),
+        pytest.param('rotor_inertia', 'hip_joint', {'inertia': 0.08}, marks=pytest.mark.evidence),
+        pytest.param(
+            'quadratic_friction', 'shank_joint', {'coefficient': 0.1}, marks=pytest.mark.evidence
+        ),
+        pytest.param(
+            'encoder_offset', 'thigh_joint_position', {'offset': 0.1}, marks=pytest.mark.evidence
+        ),
+        ('sensor_delay', None, {'delay': 0.012}),
+        pytest.param('actuator_delay', None, {'delay': 0.02}, marks=pytest.mark.evidence),
+    ],
+)
+def test_the_cause_is_worth_a_look(believed, name, at, sizes):
+    effect = believed.with_effect(name, at).effects[-1]
+    known = {p.name for p in effect.parameters}
+    sizes = {n: v for n, v in sizes.items() if n in known} or {effect.parameters[0].name: 0.3}
+    true = believed.with_values(OFF).with_effect(name, at, **sizes)
+    train = data(true, believed)
+    candidates = candidates_for(believed, [Setup()])
+    assert (name, at) in candidates
+    kept = worth_a_look(believed, train, candidates, {})
+    assert (name, at) in kept
+    assert len(kept) < len(candidates) / 2
+
+
+def test_a_sound_robot_has_little_to_look_at(believed):
+    train = data(believed.with_values(OFF), believed)
+    found = scores(believed, train, candidates_for(believed, [Setup()]), {})
+    # The bias of smoothing is no noise: a few laws gain by it, none by much.
+    assert np.median(list(found.gains.values())) < SEEN
+
+
+def test_records_are_followed_as_far_as_the_torques_are_right(believed):
+    right = [recorded(believed, 6.0, 1)]
+    lacking = [
+        recorded(believed.with_effect('torque_constant', 'thigh_joint', error=-0.4), 6.0, 1)
+    ]
+    cuts = [len(followed(believed, records)[0].cuts) for records in (right, lacking)]
+    assert cuts[0] <= cuts[1]
