@@ -12,9 +12,9 @@ in standard deviations of what the base leaves. D costs no fit and no compilatio
     a delay                        of the torque by time, or of the motion
 
 Those that gain most are then fitted by torque error, at once with the numbers of the base: what
-is far from its start is far from linear. What has states of its own, as a flexible drive, has no D;
-it is looked at on the joints of which the torques are worst explained. A robot of six joints has
-150 candidates, and a fit of one takes seconds.
+is far from its start is far from linear. What has states of its own, as a flexible drive, has no
+D; it is looked at on the joints of which the torques are worst explained. A robot of six joints
+has 150 candidates, and a fit of one takes seconds.
 """
 
 from collections.abc import Sequence
