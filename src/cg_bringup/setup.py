@@ -1,9 +1,13 @@
 from glob import glob
+from importlib.util import find_spec
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'cg_bringup'
+
+# Only where it can run: pip builds in an environment without rclpy.
+NODES = ['experimenter_node = cg_bringup.experimenter_node:main']
 
 
 def shared(*folders):
@@ -51,6 +55,7 @@ setup(
     entry_points={
         'console_scripts': [
             'balance = cg_bringup.balance_run:main',
+            'checklist = cg_bringup.checklist_run:main',
             'rebalance = cg_bringup.rebalance_run:main',
             'recover_balance = cg_bringup.recover_run:main',
             'robot = cg_bringup.robot_run:main',
@@ -58,6 +63,7 @@ setup(
             'demo = cg_bringup.demo:main',
             'experiment = cg_bringup.experiment:main',
             'replay = cg_bringup.replay:main',
+            *(NODES if find_spec('rclpy') else []),
         ],
     },
 )

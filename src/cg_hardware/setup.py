@@ -56,5 +56,6 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': NODES if find_spec('rclpy') else [],
+        'cg_hardware.drives': ['skeleton = cg_hardware.drive.skeleton:SkeletonDrive'],
     },
 )

@@ -1,11 +1,14 @@
 """Carry out an experiment on the live system: `ros2 run cg_bringup experiment NAME --out DIR`.
 
 Starts the simulated hardware, the excitation and the recorder as processes of their own, waits
-for the machine to finish, shuts the others down, checks the bag and prints its path.
+for the machine to finish, shuts the others down, checks the bag and prints its path. With
+`--mode wired` the machine is a real robot that is running (`ros2 run cg_bringup robot`): you are
+asked to hold it as the experiment wants it, and an experimenter arms, excites and disarms it.
 """
 
 import argparse
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -14,8 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from cg_bringup.runs import MODES, PATIENCE, Run, experiment_nodes
+from cg_bringup.runs import CHECKLISTS, MODES, PATIENCE, WIRED, Run, experiment_nodes
 from cg_bringup.supervisor import ProcessDied, supervised
+from cg_bringup.wired_experiment import EXPERIMENTER, pose_in_words
 from cg_description.reading import parse_yaml, read_text
 from cg_dynamics.stop_request import Stopped
 from cg_interfaces import topics
@@ -23,6 +27,7 @@ from cg_sysid.experiments.catalogue import ExperimentError, experiment_names, lo
 from cg_sysid.progress import Bars
 
 RATE_HZ = 500.0
+ENOUGH = 0.95  # of the samples of a real robot, whose host misses some
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ def run_experiment(run: Run, on_wait: Callable[[], None] = lambda: None) -> Reco
     start = time.monotonic()
     with tempfile.TemporaryFile('w+') as log:
         try:
-            _carry_out(run, on_wait, log)
+            _carry_out(run, _relaying(log, on_wait), log)
             counts = check_counts(run)
         except ExperimentError as error:
             log.seek(0)
@@ -72,16 +77,45 @@ def _carry_out(run: Run, on_wait: Callable[[], None], log: IO) -> None:
         return os.fstat(log.fileno()).st_size, _size(run.bag)
 
     try:
-        with supervised(experiment_nodes(run), log) as supervisor:
-            status = supervisor.wait('simulation_node', PATIENCE, on_wait, progress)
+        nodes = experiment_nodes(run)
+        machine = next(iter(nodes))
+        with supervised(nodes, log) as supervisor:
+            status = supervisor.wait(machine, PATIENCE, on_wait, progress)
             statuses = supervisor.end()
     except (ProcessDied, TimeoutError) as error:
         raise ExperimentError(str(error)) from None
     if status != 0:
-        raise ExperimentError(f'the machine gave up with status {status}')
+        if run.mode == WIRED:
+            _forget_unannounced(run.bag)
+        raise ExperimentError(f'{machine} gave up with status {status}')
     for name, status in statuses.items():
         if status != 0:
             raise ExperimentError(f'{name} ended with status {status}')
+
+
+def _relaying(log: IO, on_wait: Callable[[], None]) -> Callable[[], None]:
+    """`on_wait`, which also tells the person what the experimenter says meanwhile."""
+    told = 0
+
+    def relay() -> None:
+        nonlocal told
+        # Not by the handle's own place, which is that of the writers.
+        text = os.pread(log.fileno(), 65536, told)
+        lines = text[: text.rfind(b'\n') + 1]
+        told += len(lines)
+        for line in lines.decode(errors='replace').splitlines():
+            if line.startswith(EXPERIMENTER):
+                print(line.removeprefix(EXPERIMENTER), flush=True)
+        on_wait()
+
+    return relay
+
+
+def _forget_unannounced(bag: Path) -> None:
+    """Remove a bag that ended before its experiment was announced: there is none in it."""
+    metadata = bag / 'metadata.yaml'
+    if metadata.is_file() and topics.EXPERIMENT not in read_text(metadata):
+        shutil.rmtree(bag)
 
 
 def _size(bag: Path) -> int:
@@ -108,8 +142,10 @@ def check_counts(run: Run) -> dict[str, int]:
         for topic in tree['topics_with_message_count']
     }
     expected = round(run.length * RATE_HZ)
-    commands = 0 if run.mode == 'real_time' else expected
-    sparing = {topics.TORQUE_COMMAND: commands, topics.EXPERIMENT: 1}
+    if run.mode == WIRED:
+        expected = round(ENOUGH * expected)
+    commands = expected if run.mode == 'lockstep' else 0
+    sparing = {topics.TORQUE_COMMAND: commands, topics.EXPERIMENT: 1, topics.DRIVE_ENABLED: 0}
     for topic in (topics.EXPERIMENT, topics.APPLIED_TORQUE, *counts):
         needed = sparing.get(topic, expected)
         if counts.get(topic, 0) < needed:
@@ -119,16 +155,43 @@ def check_counts(run: Run) -> dict[str, int]:
     return counts
 
 
+def ask_for_pose(run: Run, yes: bool) -> None:
+    """Have a person hold the robot as the experiment wants it.
+
+    Raises:
+        ExperimentError: Nobody answers.
+    """
+    print('\n'.join(pose_in_words(run.experiment)), flush=True)
+    if yes:
+        return
+    print('Is it so, and is nobody near the legs? [Enter, Ctrl-C: no] ', end='', flush=True)
+    if not sys.stdin.readline():
+        raise ExperimentError('nobody answers; --yes asks nobody')
+
+
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_bringup experiment`."""
     parser = argparse.ArgumentParser(prog='experiment', description=__doc__)
     parser.add_argument('name', help=f'one of {", ".join(experiment_names())}; or a .yaml file')
-    parser.add_argument('--model', type=Path, help='simulated: a file or a name [nominal]')
+    parser.add_argument(
+        '--model', type=Path,
+        help='simulated, or what a real robot is believed to be: a file or a name [nominal]',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, default=1, help='of noise and excitation [1]')
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), help='directory that gets the bag [bags]'
     )
-    parser.add_argument('--mode', choices=MODES, default='lockstep', help='[lockstep]')
+    parser.add_argument(
+        '--mode', choices=(*MODES, WIRED), default='lockstep',
+        help='clock of the simulated robot; wired: a real robot that is running [lockstep]',
+    )  # fmt: skip
+    parser.add_argument(
+        '--yes', action='store_true', help='wired: the robot is held as it must be'
+    )
+    parser.add_argument(
+        '--checklists', type=Path, default=CHECKLISTS,
+        help=f'wired: folder of the records of checklists, which the bag names [{CHECKLISTS}]',
+    )  # fmt: skip
     parser.add_argument('--duration', type=float, help='in s [that of the experiment]')
     options = parser.parse_args(args)
     try:
@@ -140,9 +203,13 @@ def main(args: list[str] | None = None) -> int:
             seed=options.seed,
             mode=options.mode,
             duration=options.duration,
+            checklists=options.checklists.resolve(),
         )
         what = f'{experiment.name}, {run.length:g} s'
-        print(f'simulated robot {run.model_path.stem}: {what}', flush=True)
+        kind = 'real' if run.mode == WIRED else 'simulated'
+        print(f'{kind} robot {run.model_path.stem}: {what}', flush=True)
+        if run.mode == WIRED:
+            ask_for_pose(run, options.yes)
         with Bars('experiment') as bars:
             bars(f'recording {run.length:g} s of {experiment.name}', 0, 1)
             recorded = run_experiment(run)

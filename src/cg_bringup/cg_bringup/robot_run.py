@@ -3,7 +3,10 @@
     ros2 run cg_bringup robot --imu /dev/ttyACM0 --interface socketcan --channel can0
     ros2 run cg_bringup robot --emulated     # at a desk, with emulated devices on the wires
 
-robot.launch.py starts the same nodes. Nothing moves before a person arms the robot.
+    ros2 run cg_bringup robot --emulated inner_fixed   # the inner legs clamped, as in experiments
+
+robot.launch.py starts the same nodes. Nothing moves before a person arms the robot. The gate
+listens to `balance`, or to the experimenter, who carries out checklist and experiments.
 """
 
 import argparse
@@ -25,12 +28,14 @@ RATE_HZ = 500.0
 STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the last command
 MISSING = 0.1  # s without requests after which a person must look; busy hosts miss 30 ms
 BLIND = 0.02  # s without the encoder
+OWNERS = 'balance', 'experimenter'  # whom the gate may listen to
 NEXT = (
     'nothing moves yet. Read /robot_state; call /imu/zero and /drive/zero (legs upright and '
     'still; or /drive/home, /drive/index_by_hand), /safety_gate/arm, /drive/enable. '
     '/safety_gate/stop is the emergency stop'
 )
 FALLEN = 0.6  # rad of the stance leg
+FREE = 'free'
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ class RobotOptions:
         axis: Angle of the IMU that is the lean: roll, pitch or yaw.
         imu_sign: 1.0, or -1.0 where it counts a forward lean negative.
         zero_file: Keeps the IMU's zero; empty for none.
+        driver: Kind of drive: cia402, or one of yours.
         interface: python-can's name of the CAN adapter.
         channel: Of the adapter.
         drive: Number of the drive on the bus.
@@ -61,6 +67,7 @@ class RobotOptions:
     axis: str = 'pitch'
     imu_sign: float = 1.0
     zero_file: str = ''
+    driver: str = 'cia402'
     interface: str = 'socketcan'
     channel: str = 'can0'
     drive: int = 1
@@ -74,6 +81,11 @@ class RobotOptions:
     epsilon: float = 0.2
 
 
+def asks_as(owner: str) -> tuple[tuple[str, str], ...]:
+    """Remapping by which a controller asks the gate as that owner."""
+    return ((topics.TORQUE_COMMAND, f'{topics.TORQUE_REQUEST}/{owner}'),)
+
+
 def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
     """Node name -> what to start, in the order of ending.
 
@@ -85,19 +97,19 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
     model = {'model_file': options.model, 'sample_rate_hz': RATE_HZ}
     return {
         'drive': NodeOf('cg_hardware', 'drive_node', gate | {
-            'stale_after': STALE, 'interface': options.interface, 'channel': options.channel,
-            'node_id': options.drive, 'sign': options.drive_sign, 'gear': options.gear,
-            'counts_per_turn': options.counts_per_turn, 'zero_file': options.drive_zero_file,
+            'stale_after': STALE, 'driver': options.driver, 'interface': options.interface,
+            'channel': options.channel, 'node_id': options.drive, 'sign': options.drive_sign,
+            'gear': options.gear, 'counts_per_turn': options.counts_per_turn,
+            'zero_file': options.drive_zero_file,
         } | more),
         'imu': NodeOf('cg_hardware', 'imu_node', {
             'port': options.imu, 'baud': options.baud, 'rate_hz': RATE_HZ, 'axis': options.axis,
             'sign': options.imu_sign, 'zero_file': options.zero_file,
         }),
-        'balance': NodeOf(
-            'cg_control', 'balance_node', model, ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),)
-        ),
+        'balance': NodeOf('cg_control', 'balance_node', model, asks_as('balance')),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', gate | {
             'arming': True, 'fall_angle': FALLEN, 'stale_after': MISSING,
+            'owners': list(OWNERS), 'owner': OWNERS[0],
         }),
         'observer': NodeOf('cg_estimation', 'observer_node', model | {
             'epsilon': options.epsilon, 'longest_blind': BLIND,
@@ -111,6 +123,7 @@ TOLD = {
     'axis': 'angle of the IMU that is the lean: roll, pitch or yaw',
     'imu_sign': '1, or -1 where the IMU counts a forward lean negative',
     'zero_file': 'keeps the zero of the IMU; empty for none',
+    'driver': 'kind of drive: cia402, or one of yours (cg_hardware/drive/drivers.py)',
     'interface': "python-can's name of the CAN adapter: socketcan, slcan, ...",
     'channel': 'of the adapter',
     'drive': 'number of the drive on the bus',
@@ -126,10 +139,13 @@ TOLD = {
 
 
 @contextlib.contextmanager
-def emulated_devices(folder: Path) -> Iterator[None]:
+def emulated_devices(folder: Path, fixture: str = FREE) -> Iterator[None]:
     """Emulated devices whose wires end in a folder, while the context lasts."""
+    words = []
+    if fixture != FREE:
+        words = ['--setup', f'fixture: {fixture}', '--state', '0', '0']
     process = subprocess.Popen(
-        [sys.executable, '-m', 'cg_hardware.emulators.robot', str(folder)],
+        [sys.executable, '-m', 'cg_hardware.emulators.robot', str(folder), *words],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     try:
@@ -152,8 +168,10 @@ def main(args: list[str] | None = None) -> int:
         )  # fmt: skip
     parser.add_argument(
         '--emulated',
-        action='store_true',
-        help='no robot is there: emulated devices on pty and CAN',
+        nargs='?',
+        const=FREE,
+        choices=(FREE, 'inner_fixed', 'outer_fixed'),
+        help='no robot is there: emulated devices on pty and CAN, the robot free or in a fixture',
     )
     given = vars(parser.parse_args(args))
     emulated = given.pop('emulated')
@@ -162,7 +180,9 @@ def main(args: list[str] | None = None) -> int:
             if emulated:
                 wires = {name: f'{directory}/{name}' for name in ('imu', 'can')}
                 given |= {'imu': wires['imu'], 'interface': 'slcan', 'channel': wires['can']}
-            devices = emulated_devices(Path(directory)) if emulated else contextlib.nullcontext()
+            devices: contextlib.AbstractContextManager = contextlib.nullcontext()
+            if emulated:
+                devices = emulated_devices(Path(directory), emulated)
             with devices, supervised(robot_nodes(RobotOptions(**given))) as supervisor:
                 print(f'robot: {NEXT}', flush=True)
                 supervisor.wait('drive')

@@ -15,10 +15,12 @@ from cg_dynamics.model import Model
 from cg_interfaces import channels
 from cg_sysid.experiments.catalogue import Experiment, ExperimentError
 
-MODES = ('lockstep', 'real_time')
+MODES = ('lockstep', 'real_time')  # of the simulated machine
+WIRED = 'wired'  # the machine is a real robot that is running
 NOMINAL_MODEL = 'compass_gait_mit'
 PATIENCE = 60.0  # s without progress; on a busy machine processes take that long to start
 PEERS = 45.0  # s by which the nodes of a run may start apart
+CHECKLISTS = Path('checklists')
 ENDING = 5.0  # s that a node has to end in when it is told to
 CLOSING = 120.0  # s that the recorder may take to close its bag
 ENCLAVES = '/compass_gait'  # below it, where SROS2 finds key and permissions of a node by its name
@@ -50,11 +52,13 @@ class Run:
     Attributes:
         experiment: What is done.
         bag: Where it is recorded.
-        model_file: Model of the simulated machine, by path or name; None for the nominal one.
+        model_file: Model of the simulated machine, or of what the real one is believed to be, by
+            path or name; None for the nominal one.
         note_model_file: Model that the recording note names; None for model_file.
         seed: Of the sensor noise and of the excitation: other seeds are other records.
-        mode: 'lockstep' or 'real_time'.
+        mode: 'lockstep' or 'real_time' of a simulated machine, 'wired' of a real one.
         duration: Instead of that of the experiment, in s; None to keep it.
+        checklists: Wired: folder of the records of checklists, which the note names.
     """
 
     experiment: Experiment
@@ -64,10 +68,12 @@ class Run:
     seed: int = 1
     mode: str = 'lockstep'
     duration: float | None = None
+    checklists: Path = CHECKLISTS
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ExperimentError(f'mode is {self.mode!r}; allowed are {", ".join(MODES)}')
+        if self.mode not in (*MODES, WIRED):
+            allowed = ', '.join((*MODES, WIRED))
+            raise ExperimentError(f'mode is {self.mode!r}; allowed are {allowed}')
 
     @property
     def length(self) -> float:
@@ -81,7 +87,9 @@ class Run:
 
 
 def experiment_nodes(run: Run) -> dict[str, NodeOf]:
-    """Node name -> what to start, in the order of ending: the recorder hears the last words."""
+    """Node name -> what to start, the machine first and the recorder, which hears it all, last."""
+    if run.mode == WIRED:
+        return wired_nodes(run)
     mechanism = Model.load(run.model_path).mechanism.name
     experiment = run.experiment
     excitation = {
@@ -121,6 +129,24 @@ def experiment_nodes(run: Run) -> dict[str, NodeOf]:
 def enclave_arguments(name: str) -> list[str]:
     """ROS arguments that put a node into its enclave; without SROS2 they change nothing."""
     return ['--enclave', f'{ENCLAVES}/{name}']
+
+
+def wired_nodes(run: Run) -> dict[str, NodeOf]:
+    """The same on a real robot that is running: its experimenter, and the recorder."""
+    experimenter = {
+        'task': 'experiment',
+        'experiment': run.experiment.source or run.experiment.name,
+        'duration': run.length,
+        'seed': run.seed,
+        'model_file': str(run.model_path),
+        'checklists': str(run.checklists),
+        'yes': True,
+    }
+    recorder = {'bag': str(run.bag), 'mechanism': 'compass_gait', 'time': 'receipt'}
+    return {
+        'experimenter': NodeOf('cg_bringup', 'experimenter_node', experimenter),
+        'recorder': NodeOf('cg_sysid', 'recorder_node', recorder, ending=CLOSING),
+    }
 
 
 def parameter_file_text(nodes: Mapping[str, NodeOf]) -> str:

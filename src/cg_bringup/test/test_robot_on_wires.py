@@ -5,9 +5,10 @@ What the drive was told is read from the drive.
 
 import os
 import signal
-import time
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -17,14 +18,18 @@ pytest.importorskip('serial')
 import wired_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from wired_robot import FAULTS, connected, options_in
+from wired_robot import FAULTS, connected, held_nodes, options_in, skip_if_busy
 
+from cg_bringup.experiment import run_experiment
 from cg_bringup.robot_run import robot_nodes
-from cg_bringup.runs import NodeOf
+from cg_bringup.runs import WIRED, Run
+from cg_description.paths import model_path
 from cg_hardware.emulators.robot import INDEX
 from cg_interfaces import topics
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS
 from cg_sysid import Model, Options, diagnose, read_bag
+from cg_sysid.checks.recordings import check_recording
+from cg_sysid.experiments.catalogue import ExperimentError, load_experiment
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
@@ -120,44 +125,49 @@ def test_homing_moves_the_zero_and_no_rate_comes_of_it(tmp_path):
 
 DELAY = 0.009  # s that the emulated drive's current takes, and nobody knows of
 SETUP = 'stance: inner\nfixture: inner_fixed\n'
-NOTE = """
-format: cg_recording/1
-experiment: swing_inner_fixed
-mechanism: compass_gait
-setup: {stance: inner, fixture: inner_fixed}
-nominal_rate_hz: 500.0
-initial_state: unknown
-sensor_zeros: {imu_angle: 0.0, hip_angle: 0.0}
-zeroed_at: '%s'
-"""
 
 
-def record(folder, model_file, seed):
-    """One experiment through the wires; the bag."""
-    bag = folder / f'swing_{seed}'
+def record(folder, model_file, seed, duration=9.0):
+    """One experiment through the wires, as a person has it recorded; the bag."""
+    run = Run(
+        load_experiment('swing_inner_fixed'), folder / f'swing_{seed}', Path('compass_gait_mit'),
+        seed=seed, mode=WIRED, duration=duration, checklists=folder / 'checklists',
+    )  # fmt: skip
     words = f'--model {model_file} --state 0 0 --seed {seed}'.split()
-    nodes = robot_nodes(options_in(folder))
-    del nodes['observer'], nodes['balance']
-    nodes['safety_gate'] = replace(nodes['safety_gate'], parameters={
-        **nodes['safety_gate'].parameters, 'fall_angle': 0.0,
-    })  # fmt: skip
-    nodes['excitation'] = NodeOf('cg_sysid', 'excitation_node', {
-        'kind': 'multisine', 'amplitude': 6.0, 'f_min': 0.1, 'f_max': 3.0, 'duration': 12.0,
-        'seed': seed,
-    }, ((topics.TORQUE_COMMAND, topics.TORQUE_REQUEST),))  # fmt: skip
-    nodes['recorder'] = NodeOf('cg_sysid', 'recorder_node', {'bag': str(bag)}, ending=10.0)
-    with connected(nodes, folder, *words, '--setup', SETUP) as (robot, person, _):
+    with connected(held_nodes(folder), folder, *words, '--setup', SETUP) as (robot, person, _):
         robot.ask('can_jitter_ms 1')
         robot.ask('usb_ms 4')
-        note = person.node.create_publisher(String, topics.EXPERIMENT, LATCHED_QOS)
-        note.publish(String(data=NOTE % time.strftime('%Y-%m-%dT%H:%M:%SZ', time.gmtime())))
         person.until(lambda: person.stage == 'idle')
-        person.until(lambda: person.press('/drive/zero').success)  # it hangs still
-        assert person.press('/safety_gate/arm').success
-        person.until(lambda: person.stage == 'active')
-        assert person.press('/drive/enable').success
-        person.wait(9.0)
-    return bag
+        for device in ('imu', 'drive'):
+            person.until(lambda device=device: person.press(f'/{device}/zero').success)
+        try:
+            run_experiment(run)
+        except ExperimentError as error:
+            skip_if_busy(error)
+            raise
+        report = robot.report()
+        assert report['acting'] == 0
+        assert report['state'] != 'operation enabled'
+        person.until(lambda: person.press('/safety_gate/arm').success)  # it was left idle
+    return run.bag
+
+
+def test_an_experiment_on_the_wires_is_one_command_and_its_note_is_complete(tmp_path):
+    bag = record(tmp_path, 'compass_gait_mit', seed=3, duration=4.0)
+    report = check_recording(bag, model_path('compass_gait_mit'))
+    if report.verdict != 'good':
+        skip_if_busy([finding.text for finding in report.findings])
+    assert report.verdict == 'good', report.findings
+    codes = {finding.code for finding in report.findings}
+    about_the_note = {
+        'metadata_missing', 'zeroing_unknown', 'zeroing_stale', 'model_differs', 'not_at_rest',
+        'setup_wrong', 'sign_error', 'unit',
+    }  # fmt: skip
+    assert not codes & about_the_note
+    (checklist,) = report.of('checklist')
+    assert checklist.message == 'recorded without a checklist of the robot'
+    hip = read_bag(bag).outputs['hip_angle']
+    assert np.nanmax(np.abs(hip)) > 0.05
 
 
 @pytest.mark.evidence

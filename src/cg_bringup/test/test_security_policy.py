@@ -158,6 +158,7 @@ def started(bag):
         recovery_nodes,
         {'simulation_node': machine},
         by_hand,
+        {'experimenter': runs.NodeOf('cg_bringup', 'experimenter_node', {})},
     ]
     # Side by side behind a gate with owners.
     layout = {name: node for nodes in layouts for name, node in nodes.items()}

@@ -1,5 +1,7 @@
 """ROS node of the motor drive: CiA 402, cyclic synchronous torque, over CAN. Its words: drive/.
 
+Another drive is chosen by `driver`; drive/skeleton.py is a file to begin with.
+
 Torque acts only while a person has called ~/enable and nothing has gone wrong since. A fault of
 the drive, an emergency object, a silent drive, a bus that is gone, a drive that is too hot or
 whose voltage is out of its limits, a command that is no number, names another joint, or is older
@@ -32,7 +34,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
-from cg_hardware.drive import cia402, zero
+from cg_hardware.drive import cia402, drivers, zero
 from cg_hardware.drive.can_drive import CanDrive
 from cg_hardware.drive.cia402 import State
 from cg_hardware.drive.feet import FootRetraction
@@ -81,7 +83,7 @@ class DriveNode(Node):
 
     def __init__(self, **kwargs):
         super().__init__('drive', **kwargs)
-        self.drive: CanDrive | None = None
+        self.drive: drivers.Drive | None = None
         self.declared = DeclaredSettings(self, DriveSettings)
         settings = self.settings
         self.joints = channels.mechanism('compass_gait').joints
@@ -164,8 +166,8 @@ class DriveNode(Node):
     def _find(self) -> None:
         s = self.settings
         try:
-            self.drive = CanDrive(s.bus, s.node_id, s.sign, s.gear, s.watch, self.feet.mask)
-            if self._max_torque is not None:
+            self.drive = drivers.make(s, self.feet.mask)
+            if self._max_torque is not None and self.drive.objects is not None:
                 self.drive.objects.write(cia402.MAX_TORQUE, 0, self._max_torque, 2)
         except DriveError as error:
             if self.drive is not None:
@@ -178,8 +180,9 @@ class DriveNode(Node):
         self.drive.disable('nobody has called ~/enable')
         self._problem, self._max_torque = '', None
         objects, period = self.drive.objects, s.readings_period
-        self.voltage = Reading(VOLTAGE, objects, period)
-        self.temperature = Reading(s.temperature, objects, period) if s.temperature else None
+        if objects is not None:
+            self.voltage = Reading(VOLTAGE, objects, period)
+            self.temperature = Reading(s.temperature, objects, period) if s.temperature else None
         self._next_ns = time.monotonic_ns()
 
     def _lose(self, problem: str) -> None:
@@ -276,9 +279,10 @@ class DriveNode(Node):
         problem = self._problem or self._why_not_at_ease()
         if not problem and procedure is Homing and self.settings.absolute_encoder:
             problem = 'an absolute encoder keeps its zero, and homing would move it: call ~/zero'
-        response.success = not problem and self.drive is not None
-        response.message = problem
-        if problem or self.drive is None:
+        elif not problem and not isinstance(self.drive, CanDrive):
+            problem = f'a drive of the kind {self.settings.driver} seeks no index: call ~/zero'
+        response.success, response.message = not problem, problem
+        if problem or not isinstance(self.drive, CanDrive):
             return response
         s, objects = self.settings, self.drive.objects
         if procedure is Homing:
@@ -437,6 +441,7 @@ class DriveNode(Node):
             'cycles': self._cycles, 'answers': self._answers, 'commands_in_doubt': self._doubts,
             'cycles_left_out': self._left_out,
             'latest_cycle_ms': f'{self._longest_ns / 1e6:.2f}',
+            'zeroed_at': self.zero.taken_at if self.zero is not None and self.zero_holds else '',
             'zero': f'known: {self.zero}' if self.zero_holds else UNKNOWN,
             'feet_in': ', '.join(self.feet.retracted(time.monotonic())) or 'none',
         })  # fmt: skip

@@ -29,6 +29,7 @@ from cg_hardware.imu.device_clock import DeviceClock
 from cg_hardware.imu.mounting import AXES, Mounting, MountingError, mounting_of, zero_of
 from cg_hardware.imu.zero_file import read_zero, write_zero
 from cg_interfaces import topics
+from cg_interfaces.dates import iso_now
 from cg_interfaces.ros import (
     MACHINE_QOS,
     DeclaredSettings,
@@ -90,7 +91,8 @@ class ImuNode(Node):
         self.line: serial.Serial | None = None
         self.declared = DeclaredSettings(self, ImuSettings)
         self.settings: ImuSettings = self.declared.values
-        zero = read_zero(self.settings.zero_file) if self.settings.zero_file else 0.0
+        zero, self.zeroed_at = read_zero(self.settings.zero_file)
+        self.found: Mounting | None = None
         self.mounting = Mounting(self.settings.axis, self.settings.sign, zero)
         self.publisher = self.create_publisher(Imu, topics.IMU, MACHINE_QOS)
         self.diagnostics = self.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
@@ -146,6 +148,7 @@ class ImuNode(Node):
             )  # fmt: skip
             self.line.write(gx3.STOP_COMMAND)
             self.line.reset_input_buffer()
+            self.line.write(gx3.IDENTITY_COMMANDS)
             self.line.write(gx3.sampling_command(self.settings.rate_hz))
             self.line.write(gx3.continuous_command())
         except (serial.SerialException, OSError, ValueError) as error:
@@ -202,12 +205,14 @@ class ImuNode(Node):
             if self.problem:
                 raise MountingError(self.problem)
             zero = zero_of(self.recent)
+            zeroed_at = iso_now()
             if self.settings.zero_file:
-                write_zero(self.settings.zero_file, self.mounting, zero)
+                write_zero(self.settings.zero_file, self.mounting, zero, zeroed_at)
         except (MountingError, OSError) as error:
             response.success, response.message = False, f'no zero was taken: {error}'
             return response
         self.mounting = Mounting(self.mounting.axis, self.mounting.sign, zero.angle)
+        self.zeroed_at = zeroed_at
         response.success = True
         response.message = (
             f'zero at {zero.angle:.5f} rad, from {zero.samples} samples, still to '
@@ -223,6 +228,7 @@ class ImuNode(Node):
         response.success = not self.problem and self._euler is not None
         if response.success:
             self._upright, self._lean_until = self._euler, time.monotonic() + LEAN_WITHIN
+            self.found = None
         response.message = self.problem or f'lean forward by 0.2 rad within {LEAN_WITHIN:g} s'
         return response
 
@@ -232,7 +238,7 @@ class ImuNode(Node):
         if moved < LEAN and time.monotonic() < self._lean_until:
             return
         try:
-            found = mounting_of(self._upright, euler)
+            self.found = found = mounting_of(self._upright, euler)
         except MountingError as error:
             self.get_logger().error(f'no axis was found: {error}')
         else:
@@ -254,6 +260,10 @@ class ImuNode(Node):
             'bytes_skipped': self.parser.skipped,
             'clock_drift_ppm': f'{1e6 * self.clock.drift:.1f}',
             'clock_jumps': self.clock.jumps, 'zero_rad': f'{self.mounting.zero:.6f}',
+            'zeroed_at': self.zeroed_at, 'axis': self.mounting.axis,
+            'sign': f'{self.mounting.sign:+g}',
+            'found': f'{self.found.axis} {self.found.sign:+g}' if self.found else '',
+            **self.parser.identity,
         })  # fmt: skip
         self._published = self._repeated = 0
         self._told_bad = self.parser.bad

@@ -66,7 +66,7 @@ class GateNodeSettings(GateSettings):
     owner: str = setting('', 'the one of `owners` that is listened to', live=True)
     fall_angle: float = setting(
         0.0, 'lean of the stance leg at which the robot has fallen; 0: it never has', unit='rad',
-        minimum=0.0,
+        minimum=0.0, live=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -168,6 +168,7 @@ class SafetyGateNode(Node):
         silent = ()
         if self.declared.values.arming:
             silent = tuple(name for name, at in self._heard.items() if now - at > SILENCE)
+        self.lifecycle.fall_angle = self.declared.values.fall_angle
         self.lifecycle.see(
             Signs(silent=silent, lean=self._lean, requests=not self._stale, doubt=doubt)
         )
@@ -179,7 +180,8 @@ class SafetyGateNode(Node):
             self.gate.drop(self.lifecycle.line)
             if not self._stale:
                 self._stale = True
-                self._send((0.0,) * len(self.joints))
+                if any(self.message.effort):  # a zero that was sent already needs no copy
+                    self._send((0.0,) * len(self.joints))
         if self.lifecycle.line != self._said:
             self._said = self.lifecycle.line
             self.stage.publish(String(data=self._said))

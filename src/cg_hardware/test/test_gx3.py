@@ -34,10 +34,13 @@ def test_a_reading_is_what_the_device_sent():
 def test_commands_are_understood_and_answered():
     device, parser = Gx3Device(), gx3.Parser()
     reply = device.receive(gx3.STOP_COMMAND + gx3.sampling_command(250.0), 1.0)
-    reply += device.receive(gx3.continuous_command(), 1.0)
+    reply += device.receive(gx3.IDENTITY_COMMANDS + gx3.continuous_command(), 1.0)
     assert device.period == 0.004
     assert parser.feed(reply, 0) == []
-    assert parser.replies == {gx3.EULER_AND_RATES: 0, gx3.CONTINUOUS: 1, gx3.SAMPLING: 1}
+    assert parser.replies == {
+        gx3.EULER_AND_RATES: 0, gx3.CONTINUOUS: 1, gx3.SAMPLING: 1, gx3.IDENTITY: 2,
+    }  # fmt: skip
+    assert parser.identity == {'model': 'emulated GX3-25', 'serial': '6223-00000'}
     assert (parser.bad, parser.skipped) == (0, 0)
     device.receive(gx3.STOP_COMMAND, 1.0)
     assert sample(device, 1) == b''

@@ -137,7 +137,9 @@ def test_a_zero_is_taken_kept_and_read_again(bench, tmp_path):
     assert answer.success, answer.message
     heard = bench.listen(0.3)
     assert abs(np.mean([lean(m) for m in heard])) < 1e-3
-    assert read_zero(str(tmp_path / 'zero.yaml')) == pytest.approx(LEAN, abs=1e-3)
+    zero, taken_at = read_zero(str(tmp_path / 'zero.yaml'))
+    assert zero == pytest.approx(LEAN, abs=1e-3)
+    assert taken_at.endswith('Z')
 
 
 @pytest.mark.parametrize(
@@ -155,4 +157,4 @@ def test_a_file_that_keeps_no_zero_is_refused(tmp_path, text, said):
     file.write_text(text)
     with pytest.raises(ValueError, match=said):
         read_zero(str(file))
-    assert read_zero(str(tmp_path / 'none.yaml')) == 0.0
+    assert read_zero(str(tmp_path / 'none.yaml')) == (0.0, '')

@@ -15,6 +15,7 @@ from cg_sysid.checks.recordings import check_recording
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 from cg_sysid.records import bags
 from cg_sysid.records.findings import OVERRULABLE
+from cg_sysid.records.raw import RawTopic
 
 SAMPLES = 4000  # 8 s at 500 Hz
 # bench/evidence.py has more draws of each, and bench/check_rates.py many.
@@ -302,6 +303,39 @@ def test_each_fault_is_found_in_its_place(fault, seed):
     assert report.verdict == verdict
     if place is not None:
         assert found[0].start_s == pytest.approx(place, abs=0.06)
+
+
+def test_a_switch_is_stamped_when_it_changes():
+    rows = [0, SAMPLES - 1]
+    raw = synthesise(Synthesis(), SEEDS[0])
+    torque = raw.topics['/applied_torque']
+    enabled = RawTopic(
+        '/drive_enabled', torque.msgtype, torque.stamp_ns[rows], torque.log_ns[rows],
+        {'drive_enabled': np.array([1.0, 0.0])},
+        {'drive_enabled': np.zeros(len(rows), bool)},
+    )  # fmt: skip
+    before = {f.code for f in check_recording(raw).findings}
+    report = check_recording(replace(raw, topics={**raw.topics, '/drive_enabled': enabled}))
+    assert {f.code for f in report.findings} == before
+    assert not [f for f in report.findings if f.where in ('/drive_enabled', 'drive_enabled')]
+
+
+TRIED = {'file': 'checklist_1.yaml', 'sha256': '0' * 64, 'date': '2026-03-04T10:12:00Z',
+         'passed': 11, 'of': 12, 'failed': [], 'not_checked': ['sign of the torque']}  # fmt: skip
+
+
+@pytest.mark.parametrize(('checklist', 'severity', 'words'), [
+    (TRIED, 'info', 'checklist of 2026-03-04T10:12:00Z: passed 11 of 12, sign of the torque not'),
+    ({**TRIED, 'failed': ['clock drift']}, 'warning', 'clock drift failed'),
+    ({}, 'info', 'recorded without a checklist'),
+])  # fmt: skip
+def test_it_is_told_what_was_tried_of_the_robot(checklist, severity, words):
+    raw = synthesise(Synthesis(), SEEDS[0])
+    assert check_recording(raw).of('checklist') == []
+    report = check_recording(replace(raw, note={**raw.note, 'checklist': checklist}))
+    (found,) = report.of('checklist')
+    assert found.severity == severity
+    assert words in found.message
 
 
 @pytest.mark.parametrize('seed', SEEDS)

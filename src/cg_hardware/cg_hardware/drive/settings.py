@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cg_description.reading import parse_yaml, read_text
-from cg_hardware.drive import cia402
+from cg_hardware.drive import cia402, drivers
 from cg_hardware.drive.homing import HomingPlan
 from cg_hardware.drive.readings import Limits, Quantity
 from cg_hardware.drive.watch import WATCHES
@@ -21,6 +21,7 @@ METHODS = (*cia402.TO_INDEX, *cia402.IN_PLACE)
 class DriveSettings(GateSettings):
     """Parameters of the drive node: those of the gate, and these."""
 
+    driver: str = setting(drivers.CIA402, 'cia402, or a driver of yours (drive/drivers.py)')
     interface: str = setting('socketcan', "python-can's name of the adapter")
     channel: str = setting('can0', 'of the adapter')
     bitrate: int = setting(1_000_000, 'of the bus', unit='bit/s', minimum=10_000)
@@ -143,6 +144,7 @@ class DriveSettings(GateSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        drivers.found(self.driver)
         if abs(self.sign) != 1.0:
             raise ValueError(f'sign is {self.sign:g}; it must be 1 or -1')
         if not 1 <= abs(self.counts_per_turn) < math.inf:

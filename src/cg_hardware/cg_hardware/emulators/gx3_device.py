@@ -7,6 +7,7 @@ import struct
 from dataclasses import dataclass
 
 TIMER_HZ = 62500
+TEXTS = {0: b'6223-4220', 1: b'6223-00000', 2: b'emulated GX3-25'}
 
 
 @dataclass
@@ -48,7 +49,7 @@ class Gx3Device:
         reply = b''
         while self._incoming:
             command, rest = self._incoming[0], self._incoming
-            length = {0xC4: 4, 0xFA: 3, 0xDB: 20, 0xCF: 1}.get(command, 1)
+            length = {0xC4: 4, 0xFA: 3, 0xDB: 20, 0xCF: 1, 0xEA: 2}.get(command, 1)
             if len(rest) < length:
                 break
             message, self._incoming = rest[:length], rest[length:]
@@ -61,6 +62,9 @@ class Gx3Device:
                 if message[3] == 1:
                     (self._decimation,) = struct.unpack('>H', message[4:6])
                 reply += self._reply(b'\xdb' + message[4:16], now)
+            elif command == 0xEA and message[1] in TEXTS and not self._continuous:
+                text = bytes(message) + TEXTS[message[1]].rjust(16)
+                reply += text + struct.pack('>H', sum(text) % 65536)
         return reply
 
     def sample(self, now: float, roll: float, pitch: float, yaw: float, rates) -> bytes:

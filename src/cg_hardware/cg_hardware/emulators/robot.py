@@ -6,10 +6,12 @@ makes FOLDER/imu, the serial line of a 3DM-GX3-25, and FOLDER/can, a serial CAN 
 CiA 402 drive behind it. A person holds the robot until its drive is enabled; from then on it
 stands or falls by what the drive is told. Time is this process's own, and runs as fast as real.
 
-Faults are asked for on standard input, one a line, with a number where one is needed:
+Faults, and what hands do, are asked for on standard input or on the pipe FOLDER/hands, one a line,
+with a number where one is needed:
 
     imu_silent  imu_back  imu_frozen  imu_garbage N  imu_cut N  imu_unplug  imu_plug
     can_silent  can_back  can_garbage N  can_unplug  can_plug
+    lean A (a person leans the inner legs by A rad)  foot_inner 1  foot_outer 0 (their switches)
     drive_fault CODE  drive_off  drive_on  drive_volts V  drive_degc T  drive_lacks INDEX
     usb_ms T (the IMU's bytes go out every T ms)  can_jitter_ms T  push P (N s at the hip)
     let_go  hold  turn A (a person opens the hip by A rad more, while the robot is held)  report
@@ -50,10 +52,12 @@ PRIORITY = -19  # niceness, where it may be had
 BEHIND = 0.5  # s that the emulation may be late before it lets time go
 DRIFT = 40e-6  # of the IMU's quartz
 WRAPS_SOON = 4_294_000_000  # ticks: the counter begins anew within the first half minute
+LEANING = 0.5  # rad/s at which a person leans the legs
 SHELL = 12_345  # counts at which the encoder wakes up
 INDEX = 0.06  # rad of the hip at which the encoder has its index
 BY_HAND = 0.3  # rad/s at which a person turns the hip
 FOOT_BITS = {'inner': 1 << 16, 'outer': 1 << 17}  # of the drive's inputs, a foot switch each
+HANDS = 'hands'  # pipe in the folder of the wires
 GIMBAL = (0.012, -0.7)  # rad: roll and yaw of an IMU that is mounted as people mount things
 
 
@@ -88,6 +92,8 @@ class EmulatedRobot:
         self._held = True
         self._silent: set[str] = set()
         self._usb_s = self._jitter_s = 0.0
+        self._lean_to = self._leant = 0.0  # by a person, rad
+        self._pressed: dict[str, float] = {}  # foot switches, by a person
         self._waiting = b''
         self._flushed = 0.0
         self._late_frames: list[tuple[float, tuple[int, bytes]]] = []
@@ -130,15 +136,26 @@ class EmulatedRobot:
         self.ticks += 1
         measured = self._plant.measure()
         outputs = measured.outputs
+        self._lean(outputs)
         self._hip_rate = (outputs['hip_angle'] - self._hip) / STEP
         self._hip = outputs['hip_angle']
         self.drive.inputs = sum(
-            FOOT_BITS[leg] for leg, force in measured.contact.items() if force > 0.0
+            FOOT_BITS[leg]
+            for leg, force in (measured.contact | self._pressed).items()
+            if force > 0.0
         )
         if self.ticks % max(1, round(self.imu.period / STEP)) == 0:
             rates = (0.0, outputs['imu_rate'], 0.0)
             roll, yaw = GIMBAL
             self._waiting += self.imu.sample(self.now, roll, outputs['imu_angle'], yaw, rates)
+
+    def _lean(self, outputs: dict[str, float]) -> None:
+        """What sensors tell of inner legs that a person leans, while the outer stay."""
+        step = min(max(self._lean_to - self._leant, -LEANING * STEP), LEANING * STEP)
+        self._leant += step
+        outputs['imu_angle'] += self._leant
+        outputs['imu_rate'] += step / STEP
+        outputs['hip_angle'] += self._leant
 
     def serve(self, now: float) -> None:
         """Answer what came in on the wires, and send what is due.
@@ -233,6 +250,10 @@ class EmulatedRobot:
             self._jitter_s = number / 1000
         elif word == 'push':
             self._plant.push(number)
+        elif word == 'lean':
+            self._lean_to = number
+        elif device == 'foot':
+            self._pressed[what] = number
         elif word in ('hold', 'let_go'):
             self._held = word == 'hold'
         else:
@@ -247,6 +268,14 @@ class EmulatedRobot:
             'changes': changes, 'outputs': self.drive.outputs, 'lean': self.lean,
             'farthest': self.farthest, 'hip': self._hip, 'held': self._held, 'late': late,
         })  # fmt: skip
+
+
+def open_hands(folder: Path) -> int:
+    """The pipe by which others than the parent ask for something."""
+    path = folder / HANDS
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    return os.open(path, os.O_RDWR | os.O_NONBLOCK)  # it never comes to its end
 
 
 def main() -> int:
@@ -272,8 +301,10 @@ def main() -> int:
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)  # devices have a processor of their own
     gc.freeze()
     os.set_blocking(sys.stdin.fileno(), False)
+    hands = open_hands(options.folder)
     print('ready', flush=True)
-    begun, words = time.monotonic(), ''
+    begun = time.monotonic()
+    words = {sys.stdin.fileno(): '', hands: ''}
     while True:
         now = time.monotonic() - begun
         if now - robot.now > BEHIND:
@@ -281,20 +312,18 @@ def main() -> int:
         if now >= robot.now:
             robot.late = max(robot.late, now - robot.now)
             robot.move()
-            robot.serve(now)
-            continue
         wires = [wire for wire in (robot.can_line, robot.imu_line) if wire is not None]
-        heard, _, _ = select.select([*wires, sys.stdin], [], [], robot.now - now)
+        # Late or not: what hands do must not wait for a host that has time.
+        heard, _, _ = select.select([*wires, *words], [], [], max(0.0, robot.now - now))
         robot.serve(time.monotonic() - begun)
-        if sys.stdin not in heard:
-            continue
-        said = os.read(sys.stdin.fileno(), 65536)
-        if not said:
-            return 0
-        *lines, words = (words + said.decode()).split('\n')
-        for line in filter(str.strip, lines):
-            if answer := robot.ask(line):
-                print(answer, flush=True)
+        for source in set(words) & set(heard):
+            said = os.read(source, 65536)
+            if not said:
+                return 0
+            *lines, words[source] = (words[source] + said.decode()).split('\n')
+            for line in filter(str.strip, lines):
+                if answer := robot.ask(line):
+                    print(answer, flush=True)
 
 
 if __name__ == '__main__':

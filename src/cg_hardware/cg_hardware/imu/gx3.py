@@ -9,6 +9,7 @@ command and ends with the sum of all bytes before, modulo 2^16:
     0xC4  continuous mode           C4 C1 29 command -> C4 | command | timer | sum      8 bytes
     0xDB  sampling settings         DB A8 B9 1 | decimation of 1 kHz | flags | windows and
                                     compensations | 5 zeros  (20 bytes) ->             19 bytes
+    0xEA  a text about itself       EA n -> EA | n | 16 characters | sum                20 bytes
     0xFA  end of continuous mode    FA 75 B4, no reply
 
 The timer counts 1/62500 s and begins anew after 2^32 of them, 19 hours.
@@ -19,7 +20,9 @@ import struct
 from dataclasses import dataclass
 
 EULER_AND_RATES, CONTINUOUS, SAMPLING, STOP = 0xCF, 0xC4, 0xDB, 0xFA
-LENGTHS = {EULER_AND_RATES: 31, CONTINUOUS: 8, SAMPLING: 19}  # of replies, in bytes
+IDENTITY = 0xEA
+TEXTS = {1: 'serial', 2: 'model'}  # that are asked for
+LENGTHS = {EULER_AND_RATES: 31, CONTINUOUS: 8, SAMPLING: 19, IDENTITY: 20}  # of replies, in bytes
 TICKS_PER_S = 62_500
 TICKS = 1 << 32  # after which the timer begins anew
 BASE_RATE = 1000.0  # Hz, which the decimation divides
@@ -70,11 +73,17 @@ def continuous_command(command: int = EULER_AND_RATES) -> bytes:
 
 
 STOP_COMMAND = bytes([STOP, 0x75, 0xB4])
+IDENTITY_COMMANDS = b''.join(bytes([IDENTITY, number]) for number in TEXTS)
 
 
 def closed(body: bytes) -> bytes:
     """A message with its sum."""
     return body + struct.pack('>H', sum(body) & 0xFFFF)
+
+
+def text_of(field: bytes) -> str:
+    """What can be printed of a text of fixed length."""
+    return ''.join(chr(b) for b in field if 0x20 <= b < 0x7F).strip()
 
 
 class Parser:
@@ -85,6 +94,7 @@ class Parser:
 
     Attributes:
         replies: Command -> how many of its replies came.
+        identity: What the device says of itself: its model and serial number.
         bad: Beginnings of a reply whose sum or numbers were wrong.
         skipped: Bytes that belong to no reply.
     """
@@ -92,6 +102,7 @@ class Parser:
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.replies = dict.fromkeys(LENGTHS, 0)
+        self.identity: dict[str, str] = {}
         self.bad = 0
         self.skipped = 0
 
@@ -124,6 +135,8 @@ class Parser:
                 at += 1
                 continue
             self.replies[message[0]] += 1
+            if message[0] == IDENTITY and message[1] in TEXTS:
+                self.identity[TEXTS[message[1]]] = text_of(message[2:-2])
             if isinstance(reading, Reading):
                 found.append(reading)
             at += length

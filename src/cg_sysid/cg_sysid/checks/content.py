@@ -52,6 +52,7 @@ def check_content(
     """
     yield from _topics(raw)
     yield from _note(raw)
+    yield from _checklist(raw)
     if model is not None:
         yield from _model(raw, Path(model))
     yield from _start(raw, signals)
@@ -146,6 +147,24 @@ def _note(raw: RawRecording) -> Iterator[Finding]:
             value=age,
             allowed=ZERO_AGE_S,
         )
+
+
+def _checklist(raw: RawRecording) -> Iterator[Finding]:
+    """What was tried of the robot before it was recorded; nothing of notes that do not say."""
+    checklist = raw.note.get('checklist')
+    if checklist is None:
+        return
+    if not checklist.get('date'):
+        yield Finding('checklist', 'info', '', 'recorded without a checklist of the robot')
+        return
+    failed, left = checklist.get('failed') or (), checklist.get('not_checked') or ()
+    told = [f'passed {checklist.get("passed", 0)} of {checklist.get("of", 0)}']
+    told += [f'{title} failed' for title in failed]
+    told += [f'{title} not checked' for title in left]
+    yield Finding(
+        'checklist', 'warning' if failed else 'info', '',
+        f'checklist of {checklist["date"]}: {", ".join(told)}', value=checklist.get('file'),
+    )  # fmt: skip
 
 
 def _instant(value: object) -> float | None:

@@ -27,13 +27,15 @@ REGULAR = 0.3  # see bags.REGULAR_AFTER_SORTING
 def check_timing(raw: RawRecording) -> Iterator[Finding]:
     """Findings about the stamps of every topic of a recording.
 
-    A torque command is sent whenever there is one, so that only its order is checked.
+    A torque command is sent whenever there is one, and a switch may be stamped when it changes:
+    only their order is checked.
     """
     stamps = [t.stamp_ns for t in raw.topics.values() if len(t)]
     if not stamps:
         return
     origin = min(int(s.min()) for s in stamps)
     yield from _overlap(raw, origin)
+    switches = {topic.name for topic in raw.mechanism.extra_inputs}
     for topic in raw.topics.values():
         if len(topic) < 2:
             yield Finding(
@@ -47,7 +49,7 @@ def check_timing(raw: RawRecording) -> Iterator[Finding]:
             continue
         asked = topic.name == TORQUE_COMMAND and APPLIED_TORQUE in raw.topics
         yield from _order(topic, origin, asked)
-        if topic.name in (EXPERIMENT, TORQUE_COMMAND):
+        if topic.name in (EXPERIMENT, TORQUE_COMMAND, *switches):
             continue
         yield from _arrivals(raw, topic, origin)
         yield from _gaps(raw, topic, origin)

@@ -51,6 +51,7 @@ class Experiment:
         duration: Length in s.
         excitation: Settings of the excitation, less duration and seed.
         description: What it is good for.
+        source: Its file.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Experiment:
     duration: float
     excitation: Mapping[str, Any]
     description: str = ''
+    source: str = ''
 
 
 def experiments_directory() -> Path:
@@ -129,4 +131,5 @@ def parse_experiment(path: Path, entries: Any) -> Experiment:
         duration=tree['duration'],
         excitation=excitation,
         description=' '.join(tree['description'].split()),
+        source=str(path.resolve()),
     )

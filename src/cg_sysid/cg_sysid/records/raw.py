@@ -6,12 +6,33 @@ from typing import Any
 
 import numpy as np
 
-from cg_description.schema import NAME, Anything, Flag, Key, MapOf, Mapping, Number, Text
+from cg_description.schema import (
+    NAME,
+    Anything,
+    Flag,
+    Key,
+    ListOf,
+    MapOf,
+    Mapping,
+    Number,
+    Text,
+    Whole,
+)
 from cg_dynamics.rig import Setup
 from cg_interfaces.channels import Mechanism, mechanism
 from cg_sysid.errors import RecordingError
 
 NOTE_FORMAT = 'cg_recording/1'
+# What a note says of the checklist of the robot: cg_hardware.checklist.record.reference.
+CHECKLIST = Mapping({
+    'file': Key(Text(), default=''),
+    'sha256': Key(Text(), default=''),
+    'date': Key(Text(), default=''),
+    'passed': Key(Whole(0), default=0),
+    'of': Key(Whole(0), default=0),
+    'failed': Key(ListOf(Text()), default=()),
+    'not_checked': Key(ListOf(Text()), default=()),
+}, fill=False)  # fmt: skip
 # interfaces.md, "The recording note". The set-up has a reader of its own.
 NOTE = Mapping({
     'format': Key(Text((NOTE_FORMAT,)), default=NOTE_FORMAT),
@@ -29,6 +50,7 @@ NOTE = Mapping({
     'effort': Key(Text(('measured', 'commanded')), default='measured'),
     'closed_loop': Key(Flag(), default=False),
     'notes': Key(Text(), default=''),
+    'checklist': Key(CHECKLIST, default={}),
     'imported_from': Key(Mapping({}, further=True), default={}),
     'derived_channels': Key(MapOf(Anything()), default={}),
 }, fill=False)  # fmt: skip
