@@ -22,6 +22,7 @@ PROGRAMS = [
     'rehearse = cg_sysid.cli.rehearse:main',
     'new_model = cg_sysid.cli.new_model:main',
     'new_robot = cg_sysid.cli.new_robot:main',
+    'write_urdf = cg_sysid.cli.write_urdf:main',
     'frequency_response = cg_sysid.identification.frequency_response:main',
 ]
 NODES = [

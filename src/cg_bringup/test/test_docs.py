@@ -80,18 +80,29 @@ def test_every_page_has_a_place_on_the_site():
 
 
 @pytest.mark.slow
-def test_a_tutorial_runs_as_printed(tmp_path):
-    """The one from a CSV to a diagnosis: it needs no ROS."""
+@pytest.mark.parametrize(
+    ('page', 'answer'),
+    [
+        ('pendulum', 'The simulation lacks stribeck_friction (torque = 0.0199'),
+        pytest.param(
+            'arm', 'The simulation lacks payload@tool0 (mass = 0.2', marks=pytest.mark.evidence
+        ),
+    ],
+)
+def test_a_tutorial_runs_as_printed(page, answer, tmp_path):
+    """From a CSV, or from a URDF and bags of a robot in MuJoCo, to a diagnosis; no ROS."""
+    if page == 'arm':
+        pytest.importorskip('mujoco', reason='MuJoCo is not installed')
     for name in ('cg', 'src'):
         (tmp_path / name).symlink_to(ROOT / name)
     done = subprocess.run(
         [sys.executable, ROOT / 'tools/try_readme.py', '--within', tmp_path, '--page',
-         'docs/tutorials/pendulum.md'],
+         f'docs/tutorials/{page}.md'],
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     said = ' '.join(done.stdout.split())
     assert done.returncode == 0, f'{done.stdout}\n{done.stderr}'
-    assert 'The simulation lacks stribeck_friction (torque = 0.0199' in said
+    assert answer in said
 
 
 def test_thresholds_that_the_docs_state_are_those_of_the_search():

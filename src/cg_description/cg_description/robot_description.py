@@ -194,11 +194,20 @@ def driven_joints(text: str) -> list[str]:
     return [name for name in free if name in (controlled or transmitted)]
 
 
-def with_inertials(text: str, inertials: Mapping[str, Inertial]) -> str:
-    """A URDF with other inertias of some links; all else stays as it is written.
+def with_inertials(
+    text: str,
+    inertials: Mapping[str, Inertial | None],
+    dynamics: Mapping[str, Mapping[str, float]] | None = None,
+) -> str:
+    """A URDF with other inertias of some links and other friction; all else stays as written.
+
+    Args:
+        text: The URDF.
+        inertials: Link -> its inertia; None takes it away, where another link has it now.
+        dynamics: Joint -> `damping` and `friction` that it has from now on.
 
     Raises:
-        RobotDescriptionError: It does not have one of these links.
+        RobotDescriptionError: It does not have one of these links or joints.
     """
     robot = Xml.fromstring(
         text.encode(), Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))
@@ -209,6 +218,10 @@ def with_inertials(text: str, inertials: Mapping[str, Inertial]) -> str:
             raise RobotDescriptionError(f'URDF: no link {name!r}; there are: {", ".join(links)}')
         link = links[name]
         inertial = link.find('inertial')
+        if new is None:
+            if inertial is not None:
+                link.remove(inertial)
+            continue
         if inertial is None:
             inertial = Xml.SubElement(link, 'inertial')
         for child in list(inertial):
@@ -219,6 +232,15 @@ def with_inertials(text: str, inertials: Mapping[str, Inertial]) -> str:
         names = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
         values = map(repr, new.inertia)
         Xml.SubElement(inertial, 'inertia', dict(zip(names, values, strict=True)))
+    joints = {str(e.get('name')): e for e in robot.findall('joint')}
+    for name, numbers in (dynamics or {}).items():
+        if name not in joints:
+            raise RobotDescriptionError(f'URDF: no joint {name!r}; there are: {", ".join(joints)}')
+        element = joints[name].find('dynamics')
+        if element is None:
+            element = Xml.SubElement(joints[name], 'dynamics')
+        for key, value in numbers.items():
+            element.set(key, repr(float(value)))
     Xml.indent(robot)
     return '<?xml version="1.0"?>\n' + Xml.tostring(robot, encoding='unicode') + '\n'
 

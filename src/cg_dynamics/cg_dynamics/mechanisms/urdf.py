@@ -272,15 +272,22 @@ class Urdf(Mechanism):
             )
         return ca.mtimes([to_tree.T, matrix, to_tree])
 
-    def inertials(self, values) -> dict[str, Inertial]:
+    def inertials(self, values) -> dict[str, Inertial | None]:
         """What each body weighs by these parameters: name of its link -> inertia of all that is
-        fixed to that link, in its frame.
+        fixed to that link, in its frame; None of links that are fixed to it.
         """  # noqa: D205
-        return {
+        found: dict[str, Inertial | None] = {
             joint.child: body.inertial(values)
             for joint, body in zip(self.moving, self._bodies, strict=True)
             if body.mass > 0
         }
+        carried = {joint.child for joint in self.moving}
+        for joint in self.description.joints:
+            if joint.kind == 'fixed' and joint.parent in carried:
+                carried.add(joint.child)
+                if joint.child in self.description.inertials:
+                    found[joint.child] = None
+        return found
 
     @cached_property
     def _tree(self) -> tuple[ca.DM, ca.DM]:

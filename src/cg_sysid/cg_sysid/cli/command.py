@@ -31,6 +31,7 @@ class Command(NamedTuple):
 COMMANDS = {
     'new-model': Command('cli.new_model', 'write a commented model file to start from'),
     'new-robot': Command('cli.new_robot', 'write a model file from a URDF and recordings'),
+    'write-urdf': Command('cli.write_urdf', 'put what was identified into a URDF'),
     'import': Command(
         'records.importing', 'make recordings of logs from elsewhere: CSV, MAT, JSON'
     ),

@@ -1,0 +1,101 @@
+"""Command line: put what was identified into the URDF that a simulator loads.
+
+    cg write-urdf answer/model.yaml my.urdf --out my_identified.urdf
+
+Inertias of links, damping and friction of joints are those of the model; all else of the URDF
+stays. What a URDF cannot say is printed: armature, damping and frictionloss as MJCF has them, and
+the effects that only the model file knows.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from cg_description.model_file import write_atomically
+from cg_description.reading import read_text
+from cg_description.robot_description import RobotDescriptionError, parse, with_inertials
+from cg_dynamics.errors import ModelError
+from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.model import Model
+from cg_sysid.cli import common as cli
+
+# Effect -> what a URDF and an MJCF joint call its size.
+ATTRIBUTES = {
+    'viscous_friction': ('coefficient', 'damping', 'damping'),
+    'coulomb_friction': ('torque', 'friction', 'frictionloss'),
+    'rotor_inertia': ('inertia', None, 'armature'),
+}
+
+
+def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
+    """A URDF with the numbers of a model.
+
+    Args:
+        model: Of a URDF with the same joints.
+        text: That URDF, shapes and all.
+
+    Returns:
+        The URDF, a line of MJCF for each joint, and the labels of effects that neither can say.
+
+    Raises:
+        ModelError: if the model is of no URDF, or of one with other joints.
+    """
+    body = model.mechanism
+    if not isinstance(body, Urdf):
+        raise ModelError(f'{model.name!r} is a {body.name}; a model of a URDF is needed')
+    given = parse(text)
+    if [j.name for j in given.joints] != [j.name for j in body.description.joints]:
+        raise ModelError(f'{model.name!r} has other joints than the URDF {given.name!r}')
+    dynamics: dict[str, dict[str, float]] = {}
+    mjcf: dict[str, dict[str, float]] = {name: {} for name in body.coordinates}
+    others = []
+    for effect in model.effects:
+        if effect.name not in ATTRIBUTES:
+            others.append(effect.label)
+            continue
+        size, in_urdf, in_mjcf = ATTRIBUTES[effect.name]
+        value = model.values_of(effect)[size]
+        mjcf[effect.site][in_mjcf] = value
+        if in_urdf:
+            dynamics.setdefault(effect.site, {})[in_urdf] = value
+    lines = [
+        f'<joint name="{name}" '
+        + ' '.join(f'{key}="{value:.6g}"' for key, value in values.items()) + '/>'
+        for name, values in mjcf.items()
+        if values
+    ]  # fmt: skip
+    return with_inertials(text, body.inertials(model.values), dynamics), lines, others
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = argparse.ArgumentParser(
+        prog='cg write-urdf', description='Put identified numbers into a URDF.'
+    )
+    made.add_argument('model', type=Path, help='model file of the robot, as identify writes it')
+    made.add_argument('urdf', type=Path, help='the URDF that it was made from')
+    made.add_argument('--out', type=Path, required=True, metavar='FILE', help='where to write it')
+    return made
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run('cg write-urdf', work, parser().parse_args(args))
+
+
+def work(options: argparse.Namespace) -> int:
+    """Read, put in, write."""
+    text = read_text(options.urdf, RobotDescriptionError)
+    urdf, lines, others = written(Model.load(options.model), text)
+    if options.out.exists():
+        raise ValueError(f'--out {options.out}: exists already; name another file')
+    write_atomically(options.out, urdf)
+    print('\n'.join(lines))
+    if others:
+        print(f'in the model file only: {", ".join(others)}', file=sys.stderr)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""What was identified goes into the URDF, and a simulator moves by it as the model does."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hanging_arm import nominal, urdf
+
+from cg_description.robot_description import parse
+from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.cli.write_urdf import main
+
+WELDED = """<link name="sole"><visual><geometry><sphere radius="0.02"/></geometry></visual>
+  <inertial><mass value="0.2"/><origin xyz="0 0 -0.01"/><inertia ixx="0.0001" iyy="0.0001" izz="0.0001"
+  ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="weld" type="fixed">
+  <parent link="shank"/><child link="sole"/><origin xyz="0 0 -0.25"/></joint></robot>"""
+FOUND = {
+    'thigh_mass': 1.13, 'thigh_shift_x': 0.2, 'shank_stretch_z': 0.8, 'shank_mass': 0.93,
+    'viscous_friction@hip_joint.coefficient': 0.31, 'coulomb_friction@shank_joint.torque': 0.07,
+}  # fmt: skip
+
+
+@pytest.fixture
+def files(tmp_path):
+    text = urdf().replace('</robot>', WELDED)
+    model = nominal()
+    file = model.to_file()
+    model = Model.from_file(
+        type(file)(**{**vars(file), 'robot': {**file.robot, 'urdf': text}})
+    ).with_values(FOUND).with_effect('rotor_inertia', 'thigh_joint', inertia=0.02).with_effect(
+        'cogging_torque', 'hip_joint')  # fmt: skip
+    model.save(tmp_path / 'model.yaml')
+    (tmp_path / 'robot.urdf').write_text(text)
+    return model, tmp_path
+
+
+def test_the_urdf_moves_as_the_model_does(files, capsys):
+    model, folder = files
+    words = [str(folder / name) for name in ('model.yaml', 'robot.urdf')]
+    assert main([*words, '--out', str(folder / 'new.urdf')]) == 0
+    said = capsys.readouterr()
+    assert '<joint name="hip_joint" damping="0.31" frictionloss="0.2"/>' in said.out
+    assert 'armature="0.02"' in said.out
+    assert 'cogging_torque@hip_joint' in said.err
+    text = (folder / 'new.urdf').read_text()
+    assert '<sphere radius="0.02"' in text
+    written = Urdf(parse(text))
+    damping = {joint.name: joint.damping for joint in written.description.joints}
+    assert damping['hip_joint'] == 0.31
+    random = np.random.default_rng(3)
+    q, v, a = random.normal(size=(3, 3))
+    taken = [
+        np.asarray(ca.DM(body.inverse_dynamics(ca.SX(q), ca.SX(v), ca.SX(a), p, body.up(Setup()))))
+        for body, p in (
+            (model.mechanism, model.values),
+            (written, {p.name: p.default for p in written.parameters}),
+        )
+    ]
+    np.testing.assert_allclose(*taken, rtol=1e-9)
+
+
+def test_mistakes_get_one_line(files, capsys):
+    _, folder = files
+    other = folder / 'other.urdf'
+    other.write_text(urdf())
+    words = [str(folder / 'model.yaml'), str(other)]
+    assert main([*words, '--out', str(folder / 'new.urdf')]) == 2
+    assert 'other joints than the URDF' in capsys.readouterr().err
+    words = ['sydney_pendulum', str(other)]
+    assert main([*words, '--out', str(folder / 'new.urdf')]) == 2
+    assert 'a model of a URDF is needed' in capsys.readouterr().err
