@@ -12,9 +12,10 @@ from cg_dynamics.rig import Setup
 from cg_sysid.cli.write_urdf import main
 
 WELDED = """<link name="sole"><visual><geometry><sphere radius="0.02"/></geometry></visual>
-  <inertial><mass value="0.2"/><origin xyz="0 0 -0.01"/><inertia ixx="0.0001" iyy="0.0001" izz="0.0001"
-  ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="weld" type="fixed">
-  <parent link="shank"/><child link="sole"/><origin xyz="0 0 -0.25"/></joint></robot>"""
+  <inertial><mass value="0.2"/><origin xyz="0 0 -0.01"/>
+  <inertia ixx="0.0001" iyy="0.0001" izz="0.0001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="weld" type="fixed"><parent link="shank"/><child link="sole"/>
+  <origin xyz="0 0 -0.25"/></joint></robot>"""
 FOUND = {
     'thigh_mass': 1.13, 'thigh_shift_x': 0.2, 'shank_stretch_z': 0.8, 'shank_mass': 0.93,
     'viscous_friction@hip_joint.coefficient': 0.31, 'coulomb_friction@shank_joint.torque': 0.07,
