@@ -156,14 +156,23 @@ def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
         _pool = ProcessPoolExecutor(
             workers or os.cpu_count(),
             mp_context=multiprocessing.get_context('spawn') if script else _Modules(),
-            initializer=_ignore_interrupts,
+            initializer=_as_worker,
         )
     return _pool
 
 
-def _ignore_interrupts() -> None:
+def _as_worker() -> None:
     # Ctrl-C reaches every process of the terminal; the one that was started answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    # A parent that is killed tells nobody, and its workers would wait for work for ever.
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def processes() -> list[int]:

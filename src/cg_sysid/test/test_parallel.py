@@ -4,6 +4,8 @@ import math
 import subprocess
 import sys
 import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -137,3 +139,35 @@ def test_work_that_was_dropped_does_not_hold_the_end(tmp_path):
         [sys.executable, script], capture_output=True, text=True, timeout=25, check=False
     )
     assert done.stdout == 'out of time\n', done.stderr
+
+
+KILLED = """
+import os
+import time
+
+from cg_sysid.parallel import run_all
+
+
+def who(_):
+    time.sleep(0.5)
+    return os.getpid()
+
+
+if __name__ == '__main__':
+    print(*run_all(who, [(k,) for k in range(4)], workers=2), flush=True)
+    os.kill(os.getpid(), 9)
+"""
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    script = tmp_path / 'killed.py'
+    script.write_text(KILLED)
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=60, check=False
+    )
+    workers = {int(word) for word in done.stdout.split()}
+    assert workers, done.stderr
+    deadline = time.monotonic() + 20.0  # they notice at once, when they get to run
+    while any(Path(f'/proc/{worker}').exists() for worker in workers):
+        assert time.monotonic() < deadline, workers
+        time.sleep(0.05)
