@@ -1,8 +1,9 @@
 """Robots of a URDF that share no code with the models, and what is wrong with each.
 
-MuJoCo reads the URDF, integrates it (RK4) and has the friction: damping, and dry friction as a
-constraint with true rest. What is wrong is a number or a body of MuJoCo's where it has one, else a
-law of this file at every stage of its integrator:
+MuJoCo reads the URDF and integrates it (RK4). Dry friction that a sound robot has turns over some
+0.01 rad/s, by another law than the model's; friction that is hidden, or hard, is MuJoCo's own, a
+constraint with true rest. What else is wrong is a number or a body of MuJoCo's where it has one,
+or a law of this file at every stage of its integrator:
 
     ROBOTS    five of them, their URDFs in robots_urdf
     EFFECTS   an effect of the library -> what is wrong, drawn for a joint, a link or the robot
@@ -12,6 +13,7 @@ law of this file at every stage of its integrator:
 
 import functools
 import sys
+import xml.etree.ElementTree as Xml
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,8 +25,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / 'src/cg_sysid/test'))
 
 from mujoco_tree import wander
 
-ENGINE = 5e-4  # s, longest step of the engine
-REST = 0.002  # s, in which dry friction stops a joint (solref of MuJoCo)
+ENGINE = 2.5e-4  # s, longest step of the engine
+FINE = 1.25e-4  # s, where a constraint or teeth act: what MuJoCo's friction is off goes with it
+REST = 2 * FINE  # s, in which MuJoCo's dry friction stops a joint (solref), the least it can
+TURNS = 0.01  # rad/s or m/s, over which smooth dry friction turns
 POINT = 1e-9  # kg m^2, of a body that is a point
 TEETH_DEFLECTION = 5e-4  # rad or m that teeth give way under the largest torque
 Law = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
@@ -66,6 +70,12 @@ class Robot:
     def urdf(self) -> str:
         """Its description."""
         return (Path(__file__).parent / 'robots_urdf' / f'{self.name}.urdf').read_text()
+
+    def friction(self) -> np.ndarray:
+        """Dry friction of each joint by its URDF, read without the code that is to be judged."""
+        robot = Xml.fromstring(self.urdf)
+        found = {joint.get('name'): joint.find('dynamics') for joint in robot.iter('joint')}
+        return np.array([float(found[name].get('friction')) for name in self.joints])
 
     def place(self, joint: str) -> int:
         """Of a joint in the rows."""
@@ -116,7 +126,7 @@ class Secret:
         read: Readings of the encoders, of the true positions, (n, joints).
         command_delay: Of the drives, s.
         sensor_delay: Of the encoders, s.
-        rest: In which dry friction stops a joint, s.
+        turns: Rate over which the robot's own dry friction turns; 0 for MuJoCo's.
     """
 
     damping: Mapping[str, float] = field(default_factory=dict)
@@ -131,7 +141,7 @@ class Secret:
     read: Callable[[np.ndarray], np.ndarray] = lambda q: q
     command_delay: float = 0.0
     sensor_delay: float = 0.0
-    rest: float = REST
+    turns: float = TURNS
 
 
 @dataclass(frozen=True)
@@ -162,12 +172,14 @@ def compiled(robot: Robot, secret: Secret, step: float) -> mujoco.MjModel:
     for joint in spec.joints:
         joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        joint.solref_friction = [max(secret.rest, 2 * step), 1]
+        joint.solref_friction = [REST, 1]
         joint.solimp_friction = [0.99, 0.999, 1e-6, 0.5, 2]
     model = spec.compile()
     for name in robot.joints:
         dof = model.joint(name).dofadr[0]
         model.dof_damping[dof] += secret.damping.get(name, 0.0)
+        if secret.turns:  # _own_friction has it
+            model.dof_frictionloss[dof] = 0.0
         model.dof_frictionloss[dof] += secret.dry.get(name, 0.0)
         model.dof_armature[dof] += secret.armature.get(name, 0.0)
     # A base turned by x, then by y: what falls turns the other way in its frame.
@@ -189,9 +201,10 @@ def record(robot: Robot, secret: Secret, seed: int) -> Recording:
         secret: What is wrong with it.
         seed: Of its way and its noise.
     """
+    hard = bool(secret.dry or secret.fade or not secret.turns)
     stiff = secret.rotor is not None and secret.rotor[4] > 0
     row = 1 / robot.rate
-    step = row / round(row / (ENGINE / 4 if stiff else ENGINE))
+    step = row / round(row / (FINE if stiff or hard else ENGINE))
     model = compiled(robot, secret, step)
     data = mujoco.MjData(model)
     place = [model.joint(name).dofadr[0] for name in robot.joints]
@@ -209,9 +222,13 @@ def record(robot: Robot, secret: Secret, seed: int) -> Recording:
     late = round(secret.command_delay / step)
     pipe: list[np.ndarray] = []
     dry = model.dof_frictionloss.copy()
+    own = robot.friction()
 
     def forces(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         # At each stage of a step: a law held over a step would lag by half of it.
+        if secret.turns:
+            v = data.qvel[place]
+            data.qfrc_passive[place] -= own * v / np.hypot(v, secret.turns)
         if secret.torque:
             data.qfrc_passive[place] += secret.torque(
                 data.time, data.qpos[place], data.qvel[place]
@@ -226,7 +243,7 @@ def record(robot: Robot, secret: Secret, seed: int) -> Recording:
             data.qfrc_passive[a] -= coupled
 
     mujoco.mj_forward(model, data)
-    mujoco.set_mjcb_passive(forces if secret.torque or secret.rotor else None)
+    mujoco.set_mjcb_passive(forces)
     try:
         for i in range(rows):
             rates[i] = data.qvel[place]
@@ -552,6 +569,6 @@ def with_small_faults(robot: Robot, secret: Secret, random: np.random.Generator)
     """The same with a millisecond of delay, encoders a little off, and friction that is harder."""
     zero = 3e-4 * random.choice([-1.0, 1.0], len(robot.joints))
     return replace(
-        secret, command_delay=secret.command_delay + 1e-3, rest=secret.rest / 2,
+        secret, command_delay=secret.command_delay + 1e-3, turns=secret.turns / 2,
         read=lambda q: secret.read(q) + zero,
     )  # fmt: skip
