@@ -106,3 +106,31 @@ def test_what_is_earned_explains_something_of_the_records_that_it_is_fitted_to(f
     assert selection.to_be_earned(_leaving(base, 9.0, 9.0)) == pytest.approx(8.9, abs=0.01)
     assert selection.to_be_earned(_leaving(base, 1.1, 9.0)) == pytest.approx(1.07, abs=1e-6)
     assert selection.to_be_earned(_leaving(base, 0.9, 9.0)) == pytest.approx(0.9, abs=1e-6)
+
+
+def _believing(o, tolerances):
+    """The outcome with the first number of the file so far from what it believes, others as is."""
+    values = np.array([u.prior for u in o.train.unknowns])
+    k = next(
+        k for k, u in enumerate(o.train.unknowns)
+        if np.isfinite(u.tolerance) and u.name not in o.task.bounds
+    )  # fmt: skip
+    u = o.train.unknowns[k]
+    values[k] = u.to_value(u.to_coordinate(u.prior) + tolerances * u.tolerance)
+    return replace(o, train=replace(o.train, values=values))
+
+
+def test_what_takes_the_place_of_numbers_that_nobody_believes_lowers_no_error(fitted):
+    selection, base, (one, _), _ = fitted
+    # A law drawn a little differently is left, which nothing of the library explains.
+    heavy, one = (_leaving(o, 1.4, 1.4) for o in (_believing(base, 6.0), _believing(one, 0.0)))
+    assert selection.only_beliefs(heavy)
+    reason = selection.judge(heavy, one, 30.0).reason
+    assert 'held-out' not in reason
+    assert 'believes' not in reason
+    assert 'held-out' in selection.judge(_believing(heavy, 0.0), one, 30.0).reason
+    assert 'believes' in selection.judge(heavy, _believing(one, 6.0), 30.0).reason
+    worse = _leaving(one, 1.5, 1.4)
+    assert 'believes' in selection.judge(heavy, worse, 30.0).reason
+    assert not selection.only_beliefs(_leaving(heavy, 1.4, 2.0))
+    assert selection.compare(heavy, [one]).margin == math.inf

@@ -36,7 +36,7 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
         if not done(work, base):
             outcomes, aside = work.halving.run(
                 task, effects, title, beaten, work.selection.to_be_earned(base),
-                base.held.normalised_error,
+                base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
         comparison = work.selection.compare(base, outcomes)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))

@@ -133,7 +133,7 @@ class ModelSelection:
         fine = settings.SELECTION.thorough_fidelity if to_all else settings.SELECTION.fidelity
         fidelity = fine if white else settings.SELECTION.rough_fidelity
         margin = max(settings.SELECTION.margin, fidelity * independent / 2)
-        if at_noise(base) and not self.imitated(base):
+        if (at_noise(base) and not self.imitated(base)) or self.only_beliefs(base):
             # Beliefs decide, and those are rough: whatever relieves them is a rival.
             margin = float('inf')
         return Comparison(base, tuple(ranked), independent, margin)
@@ -150,9 +150,9 @@ class ModelSelection:
         if gained < settings.SELECTION.earned:
             reasons.append(f'evidence {gained:.1f} nats, {settings.SELECTION.earned:g} needed')
         imitated = self.imitated(base)
-        if at_noise(base) and not imitated:
+        if (at_noise(base) and not imitated) or self.only_beliefs(base):
             # No error is left to explain, but numbers that nobody believes.
-            if prior_conflicts(o) or not at_noise(o):
+            if prior_conflicts(o) or not (at_noise(o) or self._as_good(base, o)):
                 reasons.append('leaves numbers far from what the model file believes')
         elif significance < settings.SELECTION.significant or held_gain <= 0:
             reasons.append('no significant gain on held-out records')
@@ -225,9 +225,20 @@ class ModelSelection:
         """True if so little is left that nothing could explain MATERIAL of it."""
         if prior_conflicts(o) or self.imitated(o):
             return False  # beliefs decide, or whiteness
-        return bool(
-            per_output(o.held).max() < settings.NOISE.quietest + settings.SELECTION.material**2
-        )
+        return _immaterial(o)
+
+    def only_beliefs(self, o: Outcome) -> bool:
+        """True if numbers that nobody believes explain all that could be material.
+
+        What takes their place, as a payload that of an arm too heavy, lowers no error.
+        """
+        return bool(prior_conflicts(o)) and _immaterial(o)
+
+    def _as_good(self, base: Outcome, o: Outcome) -> bool:
+        """Whether an outcome leaves no more than its base, as far as fits can tell."""
+        more = np.array([o.train.normalised_error, o.held.normalised_error])
+        error = np.array([base.train.normalised_error, base.held.normalised_error])
+        return bool((more < (1 + settings.SELECTION.coarse_fidelity) * error).all())
 
     def to_be_earned(self, base: Outcome) -> float:
         """chi2/N of training records that a fit on top of a base has to come to, to be earned.
@@ -244,6 +255,12 @@ class ModelSelection:
 
     def _white(self, o: Outcome) -> bool:
         return independent_samples(o.residuals, self.steps) > settings.NOISE.white * samples(o)
+
+
+def _immaterial(o: Outcome) -> bool:
+    return bool(
+        per_output(o.held).max() < settings.NOISE.quietest + settings.SELECTION.material**2
+    )
 
 
 def explained_by(base: Outcome, o: Outcome) -> float:

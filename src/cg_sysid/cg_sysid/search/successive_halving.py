@@ -101,6 +101,7 @@ class SuccessiveHalving:
         beaten: float = np.inf,
         earned: float = np.inf,
         judged: float = np.inf,
+        by_belief: bool = False,
     ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
 
@@ -111,6 +112,8 @@ class SuccessiveHalving:
             beaten: chi2/N that is to be beaten, or nearly so.
             earned: chi2/N that has to be come to (ModelSelection.to_be_earned).
             judged: chi2/N of the base on records held out.
+            by_belief: Whether nothing but numbers that nobody believes is at stake: then errors do
+                not tell candidates apart, and all that come near are fitted to whole records.
 
         Returns:
             Outcomes of fits to whole records, and labels of those that were not worth one.
@@ -132,6 +135,15 @@ class SuccessiveHalving:
         heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= settings.HALVING.heavy]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
+        if by_belief:
+            limit = settings.HALVING.near * _smallest(screenings)
+            heat = [screening for screening in screenings if not screening.error > limit]
+            tried.update(screening.label for screening in heat)
+            most = settings.HALVING.rungs[-1]
+            tasks = [replace(screening.task, iterations=most) for screening in heat]
+            return list(self._fitted(tasks, what).values()), [
+                screening.label for screening in screenings if screening.label not in tried
+            ]
         for limit in (_favoured(_smallest(screenings)), np.inf):
             best = _best(found)
             reach = min(
