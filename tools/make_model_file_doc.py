@@ -100,14 +100,44 @@ def mechanism_section(body) -> list[str]:
     return [*lines, '']
 
 
+def robots_section() -> list[str]:
+    """The same of robots by their URDF."""
+    from cg_dynamics.mechanisms.urdf import NUMBERS
+
+    return [
+        '### `urdf`',
+        'A robot by its URDF ([robots](../how_to/robots.md)). Its coordinates and joints are those '
+        'of the URDF that move by themselves. LINK is the child link of a joint that moves.',
+        '',
+        '| parameter | unit | default | meaning | range | identified |',
+        '|---|---|---|---|---|---|',
+        *(
+            f'| `LINK_{name}` | 1 | {neutral:g} | {meaning} | {low:g} to {high:g} | where motions '
+            'show it |'
+            for name, meaning, neutral, (low, high) in NUMBERS
+        ),
+        '| `gravity` | m/s^2 | 9.81 | acceleration of gravity | 0 to 30 | no |',
+        '',
+        '| channel | | unit |',
+        '|---|---|---|',
+        '| `JOINT_effort` | input of a driven joint, for `actuators` | N m; N where it slides |',
+        '| `JOINT_position` | output of the encoder, for `sensors` | rad; m |',
+        '| `JOINT_velocity` | output of the tachometer, with `rates: true` | rad/s; m/s |',
+        '',
+    ]
+
+
 def page() -> str:
     """The whole page."""
-    from cg_description.model_file import ACTUATOR, EFFECT, QUANTITY, SCHEMA, SENSOR
+    from cg_description.model_file import ACTUATOR, EFFECT, QUANTITY, ROBOT, SCHEMA, SENSOR
     from cg_description.paths import model_path
     from cg_description.reading import YAML
     from cg_dynamics.mechanisms import MECHANISMS
 
-    names = {'quantity': QUANTITY, 'effect': EFFECT, 'sensor': SENSOR, 'actuator': ACTUATOR}
+    names = {
+        'quantity': QUANTITY, 'effect': EFFECT, 'sensor': SENSOR, 'actuator': ACTUATOR,
+        'robot': ROBOT,
+    }  # fmt: skip
     lines = [
         INTRODUCTION,
         '```yaml', model_path('sydney_pendulum').read_text('utf-8').rstrip(), '```', '',
@@ -122,12 +152,13 @@ def page() -> str:
         'may stand there once for each `at`.',
         '',
         '## Mechanisms',
-        'All parameters are needed. What they mean together, and which values no real bodies can '
+        'All parameters are needed, but for those of `urdf`. What they mean together, and which values no real bodies can '
         'have, is in [conventions.md](conventions.md).',
         '',
     ]
     for body in MECHANISMS.values():
         lines += mechanism_section(body)
+    lines += robots_section()
     lines.append(RULES.format(size=YAML.size / 1e6, nodes=YAML.nodes, depth=YAML.depth))
     return '\n'.join(lines).rstrip() + '\n'
 
