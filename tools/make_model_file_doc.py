@@ -106,8 +106,8 @@ def robots_section() -> list[str]:
 
     return [
         '### `urdf`',
-        'A robot by its URDF ([robots](../how_to/robots.md)). Its coordinates and joints are those '
-        'of the URDF that move by themselves. LINK is the child link of a joint that moves.',
+        'A robot by its URDF ([robots](../how_to/robots.md)). Its coordinates and joints are '
+        'those of the URDF that move by themselves. LINK is the child link of a joint that moves.',
         '',
         '| parameter | unit | default | meaning | range | identified |',
         '|---|---|---|---|---|---|',
@@ -152,8 +152,8 @@ def page() -> str:
         'may stand there once for each `at`.',
         '',
         '## Mechanisms',
-        'All parameters are needed, but for those of `urdf`. What they mean together, and which values no real bodies can '
-        'have, is in [conventions.md](conventions.md).',
+        'All parameters are needed, but for those of `urdf`. What they mean together, and which '
+        'values no real bodies can have, is in [conventions.md](conventions.md).',
         '',
     ]
     for body in MECHANISMS.values():
