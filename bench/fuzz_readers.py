@@ -355,7 +355,7 @@ def flip_bytes(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> byt
 
 def swap_words(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     """A few words swapped for odd ones, taken out, doubled or exchanged."""
-    words = list(_words(data))
+    words = list(_words(data)) or [b' ']
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         k, other = rng.randrange(len(words)), rng.randrange(len(words))
         kind = rng.randrange(6)
@@ -487,7 +487,7 @@ def bomb(data: bytes, rng: random.Random, seeds: tuple[bytes, ...]) -> bytes:
     fuse = rng.choice(FUSES)(n)
     if rng.random() < 0.3:
         return fuse.encode()
-    words = list(_words(data))
+    words = list(_words(data)) or [b' ']
     words[rng.randrange(len(words))] = fuse.encode()
     return b''.join(words)
 

@@ -167,10 +167,21 @@ def _require_goal(goal: np.ndarray, nodes: Nodes) -> None:
     for form in goal:
         if np.isnan(form).all():
             continue
-        if not np.isfinite(form).all() or np.linalg.eigvalsh((form + form.T) / 2).min() <= 0:
+        if not _is_positive(form):
             raise TreeError('goal must be positive definite on a leg, or NaN')
     if np.isnan(goal).all() and not nodes.orbiting.any():
         raise TreeError('goal must be positive definite on one leg at least, without an orbit')
+
+
+def _is_positive(form: np.ndarray) -> bool:
+    """Whether a form is positive definite; numbers near the largest ones need not be."""
+    if not np.isfinite(form).all():
+        return False
+    half = 0.5 * form
+    try:
+        return bool(np.linalg.eigvalsh(half + half.T).min() > 0)
+    except np.linalg.LinAlgError:
+        return False
 
 
 def _require_champions(champions: np.ndarray, nodes: Nodes) -> None:

@@ -69,6 +69,7 @@ def test_a_tree_of_another_model_is_refused(grown, tmp_path):
         ('span', lambda a: a * np.nan, 'span must be finite'),
         ('goal', lambda a: a * np.nan, 'goal must be positive definite'),
         ('goal', lambda a: -a, 'goal must be positive definite'),
+        ('goal', lambda a: np.where(a == 0, 1e308, a), 'goal must be positive definite'),
         ('goal', lambda a: a[:1], 'goal has shape'),
         ('u0', lambda a: np.array(1.0), 'u0 holds'),
         ('champions', lambda a: a * 1.0, 'champions holds'),
