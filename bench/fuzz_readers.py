@@ -15,7 +15,7 @@ characters, or in the words of the interpreter), the longest CPU time and the gr
 process's largest memory over a whole run; a second and 200 MB are allowed. A reader that takes
 more than 1 ms for an input ends after `--seconds` of CPU time, with as many as that makes.
 
-Files of parameters are not here: rcl reads them. Nor is the URDF, which is only written.
+Files of parameters are not here: rcl reads them.
 """
 
 import argparse
@@ -51,9 +51,13 @@ from cg_control.tree_files import TreeSelection
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path, models_directory
 from cg_description.reading import DocumentError, parse_yaml, read_text
+from cg_description.robot_description import driven_joints, parse
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_hardware.checklist import record as checklist
+from cg_hardware.drive.settings import read_settings
+from cg_hardware.drive.zero import read_zero as read_encoder_zero
 from cg_hardware.imu.zero_file import read_zero
 from cg_hardware.simulation import read_setup
 from cg_sysid.errors import RecordingError
@@ -161,6 +165,61 @@ samples: 250
 taken_at: '2026-03-04T10:12:00Z'
 taken_by: somebody
 """
+ENCODER_ZERO = """
+format: cg_encoder_zero/1
+zero_counts: 1234
+how: index by hand
+method: 33
+offset_rad: 0.01
+taken_at: '2026-03-04T10:12:00Z'
+taken_by: somebody
+"""
+DRIVE = """
+interface: slcan
+channel: /dev/ttyACM1
+bitrate: 500000
+node_id: 3
+sign: -1.0
+gear: 100.0
+"""
+CHECKLIST = """
+format: cg_checklist/1
+date: '2026-03-04T10:12:00Z'
+software: compass-gait 0.2.0
+emulated: false
+devices: {imu: 3DM-GX3-25 1234, drive: somebody's 5678}
+settings: {sign: -1.0, gear: 100}
+model_file: compass_gait_mit.yaml
+model_sha256: '0123'
+setup: {stance: inner}
+complete: true
+steps:
+- {name: zero, title: the zero, verdict: passed, measured: {still_mrad: 0.2}}
+- {name: sign, title: the sign, verdict: failed, reason: the wrong way}
+"""
+URDF = """<?xml version="1.0"?>
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper">
+    <inertial>
+      <origin xyz="0 0 0.2" rpy="0 0.1 0"/>
+      <mass value="1.5"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.015"/>
+    </inertial>
+  </link>
+  <link name="fore"><inertial><mass value="0.5"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3"
+      ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="revolute">
+    <origin xyz="0 0 0.5" rpy="0 0 0"/>
+    <parent link="base"/> <child link="upper"/> <axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="20" velocity="3"/> <dynamics damping="0.1" friction="0.2"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <parent link="upper"/> <child link="fore"/> <mimic joint="shoulder" multiplier="2"/>
+  </joint>
+  <transmission name="t"><joint name="shoulder"/></transmission>
+</robot>
+"""
 SELECTION = json.dumps({'path': '/a/b/tree.npz', 'sha256': '0' * 64})
 KEPT = json.dumps({
     'theta': [1.0, 2.0], 'motions': [[0.1, 0.2], [0.3]], 'cost': 1.5, 'sse': [[1.0], [2.0]],
@@ -262,6 +321,12 @@ def _read_basins(path: Path) -> None:
     SHIPPED.of(parse_yaml(read_text(path), path.name), path.name)
 
 
+def _read_urdf(path: Path) -> None:
+    text = read_text(path)
+    parse(text, path.name)
+    driven_joints(text)
+
+
 def _read_kept(path: Path) -> None:
     if _End.of(recall(path)) is None:
         raise DocumentError(f'{path}: nothing that is known')
@@ -289,6 +354,12 @@ def readers() -> dict[str, Reader]:
         'results': Reader(lambda path: read_facts(path.parent), 'diagnosis.json', _utf8(FACTS)),
         'settings': Reader(_read_basins, 'a.yaml', (basins, hidden)),
         'zero file': Reader(lambda path: read_zero(str(path)), 'a.yaml', _utf8(ZERO)),
+        'encoder zero': Reader(
+            lambda path: read_encoder_zero(str(path)), 'a.yaml', _utf8(ENCODER_ZERO)
+        ),
+        'drive settings': Reader(lambda path: read_settings(str(path)), 'a.yaml', _utf8(DRIVE)),
+        'checklist': Reader(checklist.load, 'a.yaml', _utf8(CHECKLIST)),
+        'URDF': Reader(_read_urdf, 'a.urdf', _utf8(URDF)),
         'selected tree': Reader(
             lambda path: TreeSelection.from_text(read_text(path)), 'a.json', _utf8(SELECTION)
         ),

@@ -3,10 +3,9 @@
 import math
 import typing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import DocumentError, parse_yaml, path_of, read_text, shown
 from cg_hardware.drive import cia402, drivers
 from cg_hardware.drive.homing import HomingPlan
 from cg_hardware.drive.readings import Limits, Quantity
@@ -228,23 +227,25 @@ def read_settings(path: str) -> dict[str, Any]:
     """Parameters of the drive node in a YAML file: a mapping of names and values.
 
     Raises:
-        ValueError: naming the file, the parameter, and what is allowed.
+        DocumentError: naming the file, the parameter, and what is allowed.
     """
-    found = parse_yaml(read_text(Path(path).expanduser()), path)
+    found = parse_yaml(read_text(path_of(path)), path)
     if not isinstance(found, dict):
-        raise ValueError(f'{path}: must be a mapping of parameters of the drive node')
+        raise DocumentError(f'{path}: must be a mapping of parameters of the drive node')
     kinds = typing.get_type_hints(DriveSettings)
     for name, value in found.items():
         if name not in kinds:
-            raise ValueError(f'{path}: the drive node has no parameter {name!r}')
+            raise DocumentError(f'{path}: the drive node has no parameter {shown(name)}')
         if kinds[name] is float and type(value) is int:
             found[name] = float(value)
         elif type(value) is not kinds[name]:
-            raise ValueError(f'{path}: {name} is {value!r}; a {kinds[name].__name__} is needed')
+            raise DocumentError(
+                f'{path}: {name} is {shown(value)}; a {kinds[name].__name__} is needed'
+            )
     try:
         DriveSettings(**found)
     except ValueError as error:
-        raise ValueError(f'{path}: {error}') from error
+        raise DocumentError(f'{path}: {error}') from error
     return found
 
 

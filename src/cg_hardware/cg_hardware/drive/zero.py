@@ -8,12 +8,11 @@ and the zero of the file holds.
 import os
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
-from pathlib import Path
 
 import yaml
 
 from cg_description.model_file import write_atomically
-from cg_description.reading import parse_yaml, read_text
+from cg_description.reading import DocumentError, parse_yaml, path_of, read_text
 
 FORMAT = 'cg_encoder_zero/1'
 PARALLEL = 'legs parallel'  # how a zero is taken without an index
@@ -55,7 +54,7 @@ class EncoderZero:
             OSError: The file cannot be written.
         """
         record = {'format': FORMAT} | asdict(self)
-        write_atomically(Path(path).expanduser(), yaml.safe_dump(record, sort_keys=False))
+        write_atomically(path_of(path), yaml.safe_dump(record, sort_keys=False))
 
     def __str__(self) -> str:
         method = f' by method {self.method}' if self.method else ''
@@ -67,17 +66,17 @@ def read_zero(path: str) -> EncoderZero | None:
     """The zero that a file keeps; None where there is no such file.
 
     Raises:
-        ValueError: naming the file and what is wrong in it.
+        DocumentError: naming the file and what is wrong in it.
     """
-    file = Path(path).expanduser()
+    file = path_of(path)
     if not file.exists():
         return None
     found = parse_yaml(read_text(file), str(file))
     found = found if isinstance(found, dict) else {}
     if found.get('format') != FORMAT:
-        raise ValueError(f'{file}: format must be {FORMAT}')
+        raise DocumentError(f'{file}: format must be {FORMAT}')
     counts = found.get('zero_counts')
     if type(counts) is not int or not abs(counts) < LARGEST:
-        raise ValueError(f'{file}: zero_counts must be a whole number below 2^31')
+        raise DocumentError(f'{file}: zero_counts must be a whole number below 2^31')
     told = {k: found[k] for k, kind in KEPT.items() if isinstance(found.get(k), kind)}
     return EncoderZero(counts, **told)
