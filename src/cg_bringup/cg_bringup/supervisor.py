@@ -65,28 +65,40 @@ class Supervisor:
     def __enter__(self) -> 'Supervisor':
         self.stop = StopRequest()
         try:
-            for name, module in self._modules.items():
-                self.processes[name] = subprocess.Popen(
-                    [sys.executable, '-m', 'cg_dynamics.stop_request', *module],
-                    stdin=subprocess.PIPE,
-                    stdout=self._output,
-                    stderr=None if self._output is None else subprocess.STDOUT,
-                    env=os.environ | ON_STDIN,
-                    start_new_session=True,
-                )
+            for name in self._modules:
+                self.start(name)
         except BaseException as error:
             self.__exit__(type(error))
             raise
         return self
 
+    def start(self, name: str) -> None:
+        """Start a process, or start it again once it has ended."""
+        if name in self.processes:
+            self._see_off(self.processes[name])
+        self.processes[name] = subprocess.Popen(
+            [sys.executable, '-m', 'cg_dynamics.stop_request', *self._modules[name]],
+            stdin=subprocess.PIPE,
+            stdout=self._output,
+            stderr=None if self._output is None else subprocess.STDOUT,
+            env=os.environ | ON_STDIN,
+            start_new_session=True,
+        )
+
     def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
         self.end()
-        for process in self.processes.values():
-            if process.stdin is not None:
-                process.stdin.close()
         self.stop.restore()
         if kind is None:
             self.stop.check()
+
+    @staticmethod
+    def _see_off(process: subprocess.Popen) -> None:
+        """Nothing is left of a process that has ended."""
+        # What it has started is in its session, and goes with it.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        if process.stdin is not None:
+            process.stdin.close()
 
     def wait(
         self,
@@ -140,9 +152,7 @@ class Supervisor:
                 process.kill()
                 process.wait()
             time.sleep(0.2 * POLL)
-        # What it has started is in its session, and goes with it.
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+        self._see_off(process)
         return process.returncode
 
 

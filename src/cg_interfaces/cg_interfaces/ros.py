@@ -46,6 +46,7 @@ from rclpy.utilities import remove_ros_args
 
 from cg_dynamics.stop_request import StopRequest, end_at_once, end_with_parent
 from cg_interfaces.localhost import keep_to_localhost
+from cg_interfaces.priority import take_priority
 from cg_interfaces.settings import Settings, describe, table
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -237,8 +238,7 @@ def run(
     end_at_once()
     if niceness:
         # Before anything starts a thread: threads inherit it.
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, 0, niceness)
+        take_priority(niceness)
     end_with_parent()
     keep_to_localhost(os.environ)
     # rclpy's own handlers would shut the context down before the node can send its last torque.

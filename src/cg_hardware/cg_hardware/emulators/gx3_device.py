@@ -10,6 +10,11 @@ TIMER_HZ = 62500
 TEXTS = {0: b'6223-4220', 1: b'6223-00000', 2: b'emulated GX3-25'}
 
 
+def closed(message: bytes) -> bytes:
+    """A message with its sum."""
+    return message + struct.pack('>H', sum(message) % 65536)
+
+
 @dataclass
 class Gx3Device:
     """The device.
@@ -40,8 +45,7 @@ class Gx3Device:
         return (self.timer + int(now * TIMER_HZ * (1 + self.drift))) % 2**32
 
     def _reply(self, head: bytes, now: float) -> bytes:
-        message = head + struct.pack('>I', self._ticks(now))
-        return message + struct.pack('>H', sum(message) % 65536)
+        return closed(head + struct.pack('>I', self._ticks(now)))
 
     def receive(self, data: bytes, now: float) -> bytes:
         """What it replies at time `now`, in s."""
