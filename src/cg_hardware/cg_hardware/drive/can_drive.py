@@ -155,7 +155,7 @@ class CanDrive:
     def _open(self, bus: dict) -> None:
         self._network = canopen.Network()
         # Any listener of python-can will do, whatever canopen's annotation says.
-        self._network.listeners.append(_ReadErrors())  # type: ignore[arg-type]
+        self._network.listeners.append(_ReadErrors(self._network))  # type: ignore[arg-type]
         try:
             self._network.connect(**bus)
         except (can.CanError, OSError, ValueError) as error:
@@ -366,13 +366,24 @@ class CanDrive:
 
 
 class _ReadErrors(can.Listener):
-    """Errors of reading the bus: the next cycle meets them as well, and says so."""
+    """Errors of reading the bus: the next cycle meets them as well, and says so.
+
+    Garbage on the line of a serial adapter is no error of the bus. python-can would keep what it
+    cannot decode, and stumble over it at every frame from then on.
+    """
+
+    def __init__(self, network: canopen.Network):
+        self._network = network
 
     def on_message_received(self, msg: can.Message) -> None:
         """Messages are for others."""
 
     def on_error(self, exc: Exception) -> None:
-        """The thread that reads ends without a word."""
+        """The thread that reads goes on, with a clean buffer where it has one."""
+        flush = getattr(self._network.bus, 'flush', None)
+        if isinstance(exc, ValueError) and flush is not None:
+            with contextlib.suppress(can.CanError, OSError):
+                flush()
 
 
 def told(bus: dict) -> str:
