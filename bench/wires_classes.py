@@ -330,7 +330,7 @@ def relayed() -> Iterator[dict[str, Any]]:
     def change(nodes: dict[str, NodeOf]) -> None:
         nodes['balance'] = replace(nodes['balance'], remappings=((topics.TORQUE_COMMAND, ASKED),))
 
-    yield {'change': change, 'begin': lambda rig: rig.helper(RIVALS, 'relay')}
+    yield {'change': change, 'begin': lambda rig: rig.helper(RIVALS, 'relay', between=True)}
 
 
 @contextmanager

@@ -181,7 +181,8 @@ def served(
                 random = Random(f'{seed}:{fault.name}:{k}:{attempt}')
                 try:
                     if it is None:
-                        it = stack.enter_context(rig(LOG, random.randrange(1 << 30), first, **needs))
+                        devices = random.randrange(1 << 30)
+                        it = stack.enter_context(rig(LOG, devices, first, **needs))
                         row['robots'] = 1
                         began = time.monotonic()
                     row |= trial(it, fault, random)
@@ -266,11 +267,13 @@ def lines_of(
             back = sum(r['back'] for r in own)
             cells += [
                 *(f'{x:.1f}' for x in (np.median(spent), np.quantile(spent, 0.95), spent.max())),
-                np.sum(spent > AT_MOST), f'{back} by the rule' if fault.expects == 'rule' else back,
+                np.sum(spent > AT_MOST),
+                f'{back} by the rule' if fault.expects == 'rule' else back,
             ]  # fmt: skip
         elif kinds[0] == 'balance':
             cells += [
-                sum(not r['stands'] for r in own), f'{max(r["longest_without_ms"] for r in own):.0f}'
+                sum(not r['stands'] for r in own),
+                f'{max(r["longest_without_ms"] for r in own):.0f}',
             ]
         else:
             ages = [np.inf if r['oldest_ms'] is None else r['oldest_ms'] for r in own]
@@ -286,7 +289,8 @@ def lines_of(
 
 def wrong_ones(rows: list[dict[str, Any]]) -> Iterator[str]:
     """What is not as it should be, trial by trial, and what was thrown away, by reason."""
-    said = ('zero_ms', 'back', 'stands', 'acting', 'oldest_ms', 'stage', 'status', 'errors', 'sizes')
+    said = ('zero_ms', 'back', 'stands', 'acting', 'oldest_ms', 'stage', 'status', 'errors',
+            'sizes')  # fmt: skip
     wrong = [row for row in rows if row['counts'] and not is_right(FAULTS[row['class']], row)]
     for row in wrong:
         told = ', '.join(f'{key} {row[key]}' for key in said if row.get(key) not in (None, [], ''))
@@ -303,10 +307,11 @@ def text_of(rows: list[dict[str, Any]]) -> str:
     version, seed = rows[-1]['version'], rows[-1]['seed']
     first = version.endswith('-first')
     priority = ' Robot and devices had real-time priority on a host with other work.' * first
+    times = 1 + max(row['trial'] for row in rows)
     hours = sum(row['took_s'] for row in rows) / 3600
     return '\n'.join([
         '# Faults of a robot on wires', '',
-        f'Command: `./cg exec python bench/wires_faults.py --times {1 + max(r["trial"] for r in rows)}'
+        f'Command: `./cg exec python bench/wires_faults.py --times {times}'
         f' --seed {seed}{" --first" * first}`; this page: the same with `--table-only --write`. '
         f'Sources {version}. Drive, IMU and body are emulated in another process.{priority}', '',
         f'{len(rows) - len(thrown)} trials in {hours:.1f} h. Thrown away: {reasons["held up"]} in '
@@ -343,7 +348,8 @@ def main() -> int:
                 raw.write(json.dumps(row) + '\n')
             right = row['counts'] and is_right(FAULTS[row['class']], row)
             print(
-                row['class'], row['trial'], row.get('zero_ms'), row.get('back'), row.get('lost', ''),
+                row['class'], row['trial'], row.get('zero_ms'), row.get('back'),
+                row.get('lost', ''),
                 row.get('why', ''), '' if right or not row['counts'] else 'WRONG', flush=True,
             )  # fmt: skip
     if not rows:

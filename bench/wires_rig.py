@@ -22,7 +22,10 @@ from typing import IO, Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -47,7 +50,7 @@ UPRIGHT = 0.03  # rad of lean that is standing still
 TRIES = 6
 ANSWER = 3.0  # s for a service, before it is called once more
 PER_MILLE = 25.0  # per mille of the drive's rated torque in 1 N m
-DEVICES, NODES, HELPERS = 20, 10, 5  # real-time priorities of a robot that goes first
+DEVICES, NODES = 20, 10  # real-time priorities of a robot that goes first
 KEPT = 10_000  # commands, 20 s
 
 
@@ -78,6 +81,7 @@ class Operator(Person):
                 '/safety_gate/reset', '/safety_gate/stop',
             )
         }  # fmt: skip
+        self._settings: dict[str, Client] = {}
         self._executor = EventsExecutor()
         self._executor.add_node(node)
 
@@ -118,6 +122,15 @@ class Operator(Person):
                 return future.result()
         raise Lost(f'{service} does not answer')
 
+    def set(self, node: str, name: str, value: bool) -> None:
+        """Set a parameter."""
+        if node not in self._settings:
+            self._settings[node] = self.node.create_client(SetParameters, f'{node}/set_parameters')
+        client = self._settings[node]
+        self.until(client.service_is_ready)
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        self.until(client.call_async(SetParameters.Request(parameters=[parameter])).done)
+
     def commands(self) -> list[tuple[int, int]]:
         """Stamp in ns and torque in per mille of rated of the commands that were heard."""
         heard = [deserialize_message(data, JointState) for data in self._commands]
@@ -148,7 +161,7 @@ class Rig:
         self.nodes, self.log, self.first = nodes, log, first
         self.put_first(*nodes)
         if first:
-            os.sched_setscheduler(robot.process.pid, os.SCHED_RR, os.sched_param(DEVICES))
+            go_first(robot.process, DEVICES)
         self.beside: dict[str, Any] = {}
         self._helpers: dict[str, subprocess.Popen] = {}
 
@@ -158,7 +171,8 @@ class Rig:
 
     def dead(self) -> list[str]:
         """Nodes that have ended."""
-        return [n for n, process in self.supervisor.processes.items() if process.poll() is not None]
+        processes = self.supervisor.processes.items()
+        return [name for name, process in processes if process.poll() is not None]
 
     def start(self, name: str) -> None:
         """Start a node again that has ended, and wait until it says how it goes."""
@@ -170,16 +184,16 @@ class Rig:
             said = self.person.said
             self.person.until(lambda: said.get(name, (0.0,))[0] > began)
 
-    def helper(self, *words: str) -> subprocess.Popen:
-        """A Python process beside the nodes; it is there when it has said something."""
+    def helper(self, *words: str, between: bool = False) -> subprocess.Popen:
+        """A Python process beside the nodes, or between them; it has said that it is there."""
         name = ' '.join(words)
         if name not in self._helpers:
             process = subprocess.Popen(
                 [sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
             )
-            if self.first:
-                os.sched_setscheduler(process.pid, os.SCHED_RR, os.sched_param(HELPERS))
             self._helpers[name] = process
+            if between and self.first:
+                go_first(process, NODES)
             self._hear(process)
         return self._helpers[name]
 
@@ -198,8 +212,7 @@ class Rig:
     def put_first(self, *names: str) -> None:
         """Have nodes go before what others do on this machine."""
         for name in names if self.first else ():
-            pid = self.supervisor.processes[name].pid
-            os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(NODES))
+            go_first(self.supervisor.processes[name], NODES)
 
     def hold(self) -> None:
         """Catch the robot where it is."""
@@ -229,6 +242,9 @@ class Rig:
         person.press('/drive/disable')
         self.robot.ask('stand')
         person.until(self._is_in_place)
+        if 'fallen' in person.said['balance'][1]:
+            person.set('/balance', 'armed', False)
+            person.set('/balance', 'armed', True)
         deadline = time.monotonic() + PATIENCE
         enabled = False
         while not enabled:
@@ -242,6 +258,9 @@ class Rig:
             elif stage == 'active':
                 enabled = self._enable()
             elif 'drive' in person.stage:
+                person.wait(1.0)
+                if 'drive' not in person.stage:
+                    continue
                 # One that was switched off is looked for anew when somebody wants it.
                 if person.press('/drive/enable').success:
                     raise Lost('it was let go too soon')
@@ -263,7 +282,8 @@ class Rig:
     def _is_in_place(self) -> bool:
         self.person.wait(0.02)
         report = self.report()
-        return report['held'] and abs(report['hip']) < 2e-3 and abs(report['lean'] - START[0]) < 2e-3
+        away = max(abs(report['hip']), abs(report['lean'] - START[0]))
+        return report['held'] and away < 2e-3
 
     def _stand(self) -> None:
         """Wait until it stands still."""
@@ -289,6 +309,11 @@ class Rig:
         for process in self._helpers.values():
             process.kill()
             process.communicate()
+
+
+def go_first(process: subprocess.Popen, priority: int) -> None:
+    """Have a process, and what it starts from now on, go before all ordinary work."""
+    os.sched_setscheduler(process.pid, os.SCHED_RR, os.sched_param(priority))
 
 
 @contextlib.contextmanager

@@ -372,7 +372,8 @@ class EmulatedRobot:
         changes, self._told = self.drive.log[self._told :], len(self.drive.log)
         late, self.late = self.late, 0.0
         return json.dumps({
-            'time': self.now, 'epoch_ns': self.epoch_ns, 'state': self.drive.state, 'acting': self.drive.acting,
+            'time': self.now, 'epoch_ns': self.epoch_ns,
+            'state': self.drive.state, 'acting': self.drive.acting,
             'changes': changes, 'outputs': self.drive.outputs, 'lean': self.lean,
             'farthest': self.farthest, 'hip': self._hip, 'held': self._held, 'late': late,
         })  # fmt: skip
