@@ -1,9 +1,9 @@
 """The classes of faults of a robot on its wires: how each is made, undone, and what is to come.
 
-    zero       the torque is off in time, and no other one comes before a person has looked
-    rule       the same, but the next good command acts again, as how_to/own_hardware.md has it
-    balance    nothing that a robot should mind: it stands on
-    either     the torque is zero, or the robot stands; no torque acts that is old
+zero       the torque is off in time, and no other one comes before a person has looked
+rule       the same, but the next good command acts again, as how_to/own_hardware.md has it
+balance    nothing that a robot should mind: it stands on
+either     the torque is zero, or the robot stands; no torque acts that is old
 """
 
 import math

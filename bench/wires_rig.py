@@ -318,7 +318,9 @@ def go_first(process: subprocess.Popen, priority: int) -> None:
 
 @contextlib.contextmanager
 def rig(
-    log: Path, seed: int = 1, first: bool = False,
+    log: Path,
+    seed: int = 1,
+    first: bool = False,
     change: Callable[[dict[str, NodeOf]], None] = lambda nodes: None,
     begin: Callable[['Rig'], object] = lambda rig: None,
     words: tuple[str, ...] = (),

@@ -1,11 +1,11 @@
 """Processes that speak out of turn on a robot's topics, told by their standard input.
 
-    python bench/wires_rivals.py rival     a second publisher of a torque
-        speak TOPIC LISTENERS HZ           publish TORQUE there, at 0 Hz as fast as it can; says
-                                           the ns at which it has found so many listeners
-        quiet                              is no publisher any more
-    python bench/wires_rivals.py relay     between a controller on ASKED and /torque_request
-        well | nan | joint | old S | ahead S     what becomes of the requests from now on
+python bench/wires_rivals.py rival     a second publisher of a torque
+    speak TOPIC LISTENERS HZ           publish TORQUE there, at 0 Hz as fast as it can; says
+                                       the ns at which it has found so many listeners
+    quiet                              is no publisher any more
+python bench/wires_rivals.py relay     between a controller on ASKED and /torque_request
+    well | nan | joint | old S | ahead S     what becomes of the requests from now on
 """
 
 import math

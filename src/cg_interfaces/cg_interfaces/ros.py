@@ -12,7 +12,6 @@ The only module outside `*_node.py` that imports rclpy. A node is built on three
   be due without a pause has `eagerness`, the messages that it takes from one to the next.
 """
 
-import contextlib
 import dataclasses
 import gc
 import inspect

@@ -280,8 +280,9 @@ class EmulatedRobot:
             self._flushed = now
             self.imu_line.write(self._waiting)
             self._waiting = b''
-            for instant, pitch in self._unsent if self.trace is not None else ():
-                self.trace.write(f'sample {instant} {time.time_ns()} {pitch!r}\n')
+            if self.trace is not None:
+                for instant, pitch in self._unsent:
+                    self.trace.write(f'sample {instant} {time.time_ns()} {pitch!r}\n')
             self._unsent = []
 
     def ask(self, line: str) -> str:
@@ -320,10 +321,15 @@ class EmulatedRobot:
         elif word in ('can_lose', 'can_noise'):
             self._bad_frames = word, int(number)
         elif word == 'can_foreign' and self.can_line is not None:
-            self._can.send([
-                (self._random.choice(FOREIGN), self._random.randbytes(self._random.randrange(9)))
-                for _ in range(int(number))
-            ])
+            self._can.send(
+                [
+                    (
+                        self._random.choice(FOREIGN),
+                        self._random.randbytes(self._random.randrange(9)),
+                    )
+                    for _ in range(int(number))
+                ]
+            )
         elif word == 'drive_fault':
             emergency = self.drive.fault(int(number), self.now)
             if self.can_line is not None:
