@@ -155,9 +155,12 @@ def record(folder, model_file, seed, duration=9.0):
 def test_an_experiment_on_the_wires_is_one_command_and_its_note_is_complete(tmp_path):
     bag = record(tmp_path, 'compass_gait_mit', seed=3, duration=4.0)
     report = check_recording(bag, model_path('compass_gait_mit'))
-    if report.verdict != 'good':
+    # A host may lose a sample; that is no matter of the note, and a warning at most.
+    told = {finding.code: finding for finding in report.findings if finding.severity != 'info'}
+    if any(finding.severity == 'error' for finding in told.values()):
         skip_if_busy([finding.text for finding in report.findings])
-    assert report.verdict == 'good', report.findings
+    assert set(told) <= {'dropped_samples'}, report.findings
+    assert report.verdict in ('good', 'warnings'), report.findings
     codes = {finding.code for finding in report.findings}
     about_the_note = {
         'metadata_missing', 'zeroing_unknown', 'zeroing_stale', 'model_differs', 'not_at_rest',
