@@ -247,6 +247,22 @@ def test_locked_joints_stand_where_they_are_held():
         assemble(model, Setup(locked=(('knee', 0.0),)))
 
 
+def test_what_is_compiled_is_of_the_set_up():
+    model = robot(random_tree(6, 3, slide=0))
+    first = model.mechanism.coordinates[0]
+    time, u, start = np.arange(0, 0.1, 0.002), np.zeros((50, 3)), np.zeros(4)
+    ends = [
+        simulate(model, setup, time, u, start)[1][-1]
+        for setup in (
+            Setup(locked=((first, 0.5),)), Setup(locked=((first, -0.5),)),
+            Setup(locked=((first, 0.5),), gravity=(0.0, 1.0, 0.0)),
+        )
+    ]  # fmt: skip
+    assert [end[0] for end in ends] == [0.5, -0.5, 0.5]
+    assert not np.allclose(ends[0][1:], ends[1][1:])
+    assert not np.allclose(ends[0][1:], ends[2][1:])
+
+
 def test_gravity_comes_from_the_set_up():
     # Mounted on a wall: what hung along -z hangs along +x.
     model = robot(PENDULUM)

@@ -346,7 +346,8 @@ def compile_model(
 
     Args:
         model: Its structure counts, its values do not (but for effects at neutral).
-        setup: Its structure counts: stance, fixture, number and bodies of springs.
+        setup: Its structure counts: stance, fixture, number and bodies of springs; of a URDF, which
+            joints are locked where, and gravity.
         free: Parameters with sensitivities; by default all that are declared free.
     """
     if free is None:
@@ -363,7 +364,8 @@ def compile_model(
         setup.stance,
         setup.fixture,
         tuple(spring.body for spring in setup.springs),
-        tuple(name for name, _ in setup.locked),
+        setup.locked,
+        setup.gravity,
         free,
     )
     if key not in _built:
