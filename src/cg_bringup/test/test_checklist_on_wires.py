@@ -10,7 +10,8 @@ pytest.importorskip('rclpy')
 pytest.importorskip('canopen')
 pytest.importorskip('serial')
 
-from wired_robot import connected, held_nodes, skip_if_busy
+from emulated_robot import skip_if_busy
+from wired_robot import connected, held_nodes
 
 from cg_hardware.checklist import record
 from cg_hardware.checklist.steps import NAMES

@@ -16,9 +16,10 @@ pytest.importorskip('canopen')
 pytest.importorskip('serial')
 
 import wired_robot
+from emulated_robot import skip_if_busy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from wired_robot import FAULTS, connected, held_nodes, options_in, skip_if_busy
+from wired_robot import FAULTS, connected, held_nodes, options_in
 
 from cg_bringup.experiment import run_experiment
 from cg_bringup.robot_run import robot_nodes

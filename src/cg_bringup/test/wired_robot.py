@@ -7,7 +7,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import pytest
 import rclpy
 from emulated_robot import Emulated
 from rclpy.node import Node
@@ -70,12 +69,6 @@ def options_in(folder) -> RobotOptions:
     return RobotOptions(
         imu=str(folder / 'imu'), interface='slcan', channel=str(folder / 'can'), epsilon=0.02
     )
-
-
-def skip_if_busy(why):
-    """A verdict on deadlines means nothing while more is running than there are cores."""
-    if os.getloadavg()[0] > (os.cpu_count() or 1):
-        pytest.skip(f'the host is busy, and {why}')
 
 
 def held_nodes(folder):

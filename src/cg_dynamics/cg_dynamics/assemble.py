@@ -195,10 +195,10 @@ def assemble(model: Model, setup: Setup) -> Equations:
     displaced = [e.foot(body, own[e.label]) for e in effects if overrides(e, 'foot')]
     body = replace(body, foot=sum(displaced, body.foot))
     a = ca.SX.sym('a', *s.shape)
-    taken = mechanism.inverse_dynamics(q, v, ca.mtimes(kinematics.basis, a), by_name, up)
+    recursion = mechanism.recursion(q, v, ca.mtimes(kinematics.basis, a), by_name, up)
     energies = mechanism.energies(q, v, by_name, setup, up, body.foot)
     # What recursion does not give is derived from the energies.
-    kinetic, potential = energies if taken is None else (ca.SX(0), ca.SX(0))
+    kinetic, potential = energies if recursion is None else (ca.SX(0), ca.SX(0))
     for stretch, stiffness in body.springs():
         potential += stiffness * stretch**2 / 2
     force = ca.SX.zeros(q.shape)
@@ -220,8 +220,8 @@ def assemble(model: Model, setup: Setup) -> Equations:
     load = ca.mtimes(kinematics.basis.T, force) - bias
     imbalance = load - ca.mtimes(mass_matrix, a)
     energy = kinetic + potential
-    if taken is not None:
-        own_mass = mechanism.mass_matrix(q, by_name)
+    if recursion is not None:
+        own_mass, taken = recursion
         taken, own_mass, own_energy = ca.substitute(
             [ca.mtimes(kinematics.basis.T, taken),
              ca.mtimes([kinematics.basis.T, own_mass, kinematics.basis]), sum(energies)],

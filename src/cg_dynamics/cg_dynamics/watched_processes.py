@@ -177,7 +177,7 @@ def _work(pipe: Connection) -> None:
     """What a process does: one piece of work after the other."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_spawner()
     # Who asked may be gone, or no longer wait.
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -207,8 +207,16 @@ def _answer(function: Callable[..., Any], arguments: tuple) -> bytes:
             return pickle.dumps((FAILED, RuntimeError(f'{type(error).__name__}: {error}')))
 
 
-def _end_with_parent() -> None:
+def end_with_spawner() -> None:
+    """Let this spawned process end when the one that spawned it does, however that went.
+
+    A process that is killed tells nobody, and its workers would wait for work for ever.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -88,9 +88,9 @@ def test_mass_matrix_bias_and_torques_as_in_drake(seed, joints):
     close(taken.ravel(), plant.CalcInverseDynamics(context, there[2], forces)[place])
 
 
-def test_a_joint_that_follows_another_moves_as_in_mujoco():
-    # MuJoCo couples them by a stiff constraint, we by arithmetic: so the comparison is of motions
-    # that both bodies share, and of M and b by the chain rule from the tree without the coupling.
+def test_a_joint_that_follows_another_obeys_the_chain_rule():
+    # Engines couple such joints by stiff constraints, so the tree without the coupling is the
+    # oracle: it agrees with them above.
     text, loose = (random_tree(5, 4, mimic=follows) for follows in (True, False))
     body, f = ours(text)
     _, g = ours(loose)

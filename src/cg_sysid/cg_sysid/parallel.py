@@ -25,6 +25,7 @@ from concurrent.futures import (
 from contextvars import ContextVar
 from typing import Any
 
+from cg_dynamics.watched_processes import end_with_spawner
 from cg_sysid.deadline import OutOfTime, check_time, current
 
 POLL_S = 0.2  # between looks at a deadline
@@ -164,15 +165,7 @@ def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
 def _as_worker() -> None:
     # Ctrl-C reaches every process of the terminal; the one that was started answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    # A parent that is killed tells nobody, and its workers would wait for work for ever.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    end_with_spawner()
 
 
 def processes() -> list[int]:

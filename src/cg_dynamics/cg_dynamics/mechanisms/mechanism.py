@@ -132,19 +132,15 @@ class Mechanism(ABC):
         """Unit vector against gravity where nothing tilts the ground."""
         return ca.SX([0, 1])
 
-    def inverse_dynamics(
+    def recursion(
         self, q: ca.SX, v: ca.SX, a: ca.SX, p: Symbols, up: ca.SX
-    ) -> ca.SX | None:
-        """Generalised forces M a + b that an acceleration a takes, shape (n, 1).
+    ) -> tuple[ca.SX, ca.SX] | None:
+        """Mass matrix M(q), shape (n, n), and the forces M a + b that a takes, shape (n, 1).
 
-        A mechanism of many joints gives them, and `mass_matrix`, by recursion; for None they are
-        derived from the energies.
+        A mechanism of many joints has them by recursion; for None they are derived from the
+        energies.
         """
         return None
-
-    def mass_matrix(self, q: ca.SX, p: Symbols) -> ca.SX:
-        """M(q), shape (n, n), of a mechanism that has `inverse_dynamics`."""
-        raise NotImplementedError
 
     def consistency(self, p: Mapping[str, Any]) -> list[Any]:
         """Expressions that are positive if and only if real bodies have these parameters."""

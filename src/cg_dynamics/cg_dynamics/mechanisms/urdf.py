@@ -177,18 +177,20 @@ class Urdf(Mechanism):
             read |= dict(zip(self.outputs[len(self.coordinates) :], ca.vertsplit(v), strict=True))
         return read
 
+    def recursion(self, q, v, a, p: Symbols, up):
+        """(CRB) and (NE)."""
+        return self.mass_matrix(q, p), self.inverse_dynamics(q, v, a, p, up)
+
     def inverse_dynamics(self, q, v, a, p: Symbols, up):
-        """(NE), from the base out and back."""
-        to_tree, offset = self._tree
-        q, v, a = ca.mtimes(to_tree, q) + offset, ca.mtimes(to_tree, v), ca.mtimes(to_tree, a)
+        """Forces that an acceleration takes, by (NE), from the base out and back."""
+        to_tree, _ = self._tree
+        placed, place = self._placed(q), self._order
+        v, a = ca.mtimes(to_tree, v), ca.mtimes(to_tree, a)
         still = ca.SX.zeros(3)
         motion = {self.description.root: (still, still, up * p['gravity'])}
-        place = {joint.name: k for k, joint in enumerate(self.moving)}
-        turns = {}
         for joint in self.description.joints:
             w, dw, acceleration = motion[joint.parent]
-            turn, origin = _placed(joint, q[place[joint.name]] if joint.name in place else None)
-            turns[joint.name] = turn, origin
+            turn, origin = placed[joint.name]
             acceleration = acceleration + ca.cross(dw, origin) + ca.cross(w, ca.cross(w, origin))
             w, dw, acceleration = (ca.mtimes(turn.T, x) for x in (w, dw, acceleration))
             if joint.name in place:
@@ -217,23 +219,18 @@ class Urdf(Mechanism):
                 needed[place[joint.name]] = ca.dot(
                     ca.DM(joint.axis), force if joint.slides else moment
                 )
-            turn, origin = turns[joint.name]
+            turn, origin = placed[joint.name]
             force, moment = ca.mtimes(turn, force), ca.mtimes(turn, moment)
             f, n = loads[joint.parent]
             loads[joint.parent] = f + force, n + moment + ca.cross(origin, force)
         return ca.mtimes(to_tree.T, ca.vertcat(*needed))
 
     def mass_matrix(self, q, p: Symbols):
-        """(CRB): each joint moves all that it carries, as one body."""
-        to_tree, offset = self._tree
-        q = ca.mtimes(to_tree, q) + offset
-        place = {joint.name: k for k, joint in enumerate(self.moving)}
+        """M(q) by (CRB): each joint moves all that it carries, as one body."""
+        to_tree, _ = self._tree
+        placed, place = self._placed(q), self._order
         nothing = (ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3))
         carried = dict.fromkeys(self.description.links, nothing)
-        turns = {
-            joint.name: _placed(joint, q[place[joint.name]] if joint.name in place else None)
-            for joint in self.description.joints
-        }
         for joint, body in zip(self.moving, self._bodies, strict=True):
             carried[joint.child] = body.symbols(p)
         matrix = ca.SX.zeros(len(self.moving), len(self.moving))
@@ -249,7 +246,7 @@ class Urdf(Mechanism):
                 matrix[k, k] = ca.dot(axis, force if joint.slides else moment)
                 down = joint
                 while down.parent in above:
-                    turn, origin = turns[down.name]
+                    turn, origin = placed[down.name]
                     force, moment = ca.mtimes(turn, force), ca.mtimes(turn, moment)
                     moment = moment + ca.cross(origin, force)
                     down = above[down.parent]
@@ -257,18 +254,18 @@ class Urdf(Mechanism):
                         axis = ca.DM(down.axis)
                         entry = ca.dot(axis, force if down.slides else moment)
                         matrix[k, place[down.name]] = matrix[place[down.name], k] = entry
-            turn, origin = turns[joint.name]
+            turn, origin = placed[joint.name]
             m0, h0, inertia0 = carried[joint.parent]
             moved = ca.mtimes(turn, h)
-            arm, offset_of = ca.skew(origin), ca.skew(moved)
+            arm, moment_arm = ca.skew(origin), ca.skew(moved)
             carried[joint.parent] = (
                 m0 + m,
                 h0 + moved + m * origin,
                 inertia0
                 + ca.mtimes([turn, inertia, turn.T])
                 - m * ca.mtimes(arm, arm)
-                - ca.mtimes(arm, offset_of)
-                - ca.mtimes(offset_of, arm),
+                - ca.mtimes(arm, moment_arm)
+                - ca.mtimes(moment_arm, arm),
             )
         return ca.mtimes([to_tree.T, matrix, to_tree])
 
@@ -299,14 +296,28 @@ class Urdf(Mechanism):
             follow[k, free[leader]] = ratio
         return ca.DM(follow), ca.DM(offset)
 
+    @cached_property
+    def _order(self) -> dict[str, int]:
+        """Where each joint that moves stands among those that do."""
+        return {joint.name: k for k, joint in enumerate(self.moving)}
+
+    def _placed(self, q) -> dict[str, tuple[ca.SX, ca.SX]]:
+        """Joint -> orientation, (3, 3), and origin, (3, 1), of its child in its parent's frame."""
+        to_tree, offset = self._tree
+        positions = ca.vertsplit(ca.mtimes(to_tree, q) + offset)
+        return {
+            joint.name: _child_frame(
+                joint, positions[self._order[joint.name]] if joint.kind != 'fixed' else None
+            )
+            for joint in self.description.joints
+        }
+
     def _frames(self, q) -> dict[str, tuple[ca.SX, ca.SX]]:
         """Link -> its orientation, shape (3, 3), and origin, (3, 1), in the root's frame."""
-        to_tree, offset = self._tree
-        q = ca.mtimes(to_tree, q) + offset
-        place = {joint.name: k for k, joint in enumerate(self.moving)}
+        placed = self._placed(q)
         frames = {self.description.root: (ca.SX.eye(3), ca.SX.zeros(3))}
         for joint in self.description.joints:
-            turn, origin = _placed(joint, q[place[joint.name]] if joint.name in place else None)
+            turn, origin = placed[joint.name]
             before, at = frames[joint.parent]
             frames[joint.child] = ca.mtimes(before, turn), at + ca.mtimes(before, origin)
         return frames
@@ -316,7 +327,8 @@ class Urdf(Mechanism):
 
         The dynamics are linear in the inertias of the bodies, in fewer combinations of them (base
         parameters) than there are. Of the numbers here a set is left free, each chosen as the one
-        that the motions show best beside those before it, that spans what all of them do.
+        that the motions show best beside those before it, that spans what all of them do. Gravity
+        is along -z there: what only another mounting would show is left alone.
         """
         effect = self._by_parameters(np.random.default_rng(0))
         count = effect.shape[1]
@@ -408,7 +420,7 @@ class _Body:
         )  # fmt: skip
 
 
-def _placed(joint: Joint, position: ca.SX | None) -> tuple[ca.SX, ca.SX]:
+def _child_frame(joint: Joint, position: ca.SX | None) -> tuple[ca.SX, ca.SX]:
     """Orientation and origin of a joint's child link in its parent's frame."""
     turn, origin = ca.SX(ca.DM(rotation(joint.rpy))), ca.SX(ca.DM(joint.xyz))
     if position is None:

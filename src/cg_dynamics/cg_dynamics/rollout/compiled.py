@@ -346,8 +346,8 @@ def compile_model(
 
     Args:
         model: Its structure counts, its values do not (but for effects at neutral).
-        setup: Its structure counts: stance, fixture, number and bodies of springs; of a URDF, which
-            joints are locked where, and gravity.
+        setup: Its structure counts: stance, fixture, number and bodies of springs; of a URDF where
+            joints are locked, and gravity.
         free: Parameters with sensitivities; by default all that are declared free.
     """
     if free is None:

@@ -59,11 +59,9 @@ OTHERS = """\
 # which an identification starts.
 """
 WIDTH = 99
-# Effect -> its size, and where a URDF has it.
-FRICTION = {
-    'viscous_friction': ('coefficient', 'damping'),
-    'coulomb_friction': ('torque', 'friction'),
-}
+DOUBT = 0.5  # of friction in a URDF, relative: it is a guess more often than not
+# Effect -> what a URDF's `dynamics` calls its size.
+FRICTION = {'viscous_friction': 'damping', 'coulomb_friction': 'friction'}
 
 
 def template(
@@ -159,20 +157,20 @@ def _bodies(body: Urdf) -> Iterator[str]:
 
 def _effects(body: Urdf, description: RobotDescription) -> Iterator[str]:
     stated = [
-        (joint, name, parameter, getattr(joint, attribute))
+        (joint, name, getattr(joint, attribute))
         for joint in description.independent
-        for name, (parameter, attribute) in FRICTION.items()
+        for name, attribute in FRICTION.items()
         if getattr(joint, attribute)
     ]
     if stated:
         yield 'effects:'
-    for joint, name, parameter, value in stated:
-        unit = LIBRARY[name](body, joint.name).parameters[0].unit
+    for joint, name, value in stated:
+        size = LIBRARY[name](body, joint.name).parameters[0]
         yield f'- name: {name}   # {shortened(LIBRARY[name].summary, name)}'
         if len(body.coordinates) > 1:
             yield f'  at: {joint.name}'
-        q = Quantity(value, unit, 0.5 * value, source='dynamics in the URDF')
-        yield f'  parameters: {{{parameter}: {flow(q)}}}'
+        q = Quantity(value, size.unit, DOUBT * value, source='dynamics in the URDF')
+        yield f'  parameters: {{{size.name}: {flow(q)}}}'
 
 
 def _others(body: Urdf) -> list[str]:

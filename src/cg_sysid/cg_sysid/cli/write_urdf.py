@@ -19,13 +19,12 @@ from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_sysid.cli import common as cli
+from cg_sysid.cli.new_robot import FRICTION
 
-# Effect -> what a URDF and an MJCF joint call its size.
-ATTRIBUTES = {
-    'viscous_friction': ('coefficient', 'damping', 'damping'),
-    'coulomb_friction': ('torque', 'friction', 'frictionloss'),
-    'rotor_inertia': ('inertia', None, 'armature'),
-}
+# Effect -> what an MJCF joint calls its size.
+MJCF = {
+    'viscous_friction': 'damping', 'coulomb_friction': 'frictionloss', 'rotor_inertia': 'armature',
+}  # fmt: skip
 
 
 def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
@@ -51,14 +50,13 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
     mjcf: dict[str, dict[str, float]] = {name: {} for name in body.coordinates}
     others = []
     for effect in model.effects:
-        if effect.name not in ATTRIBUTES:
+        if effect.name not in MJCF:
             others.append(effect.label)
             continue
-        size, in_urdf, in_mjcf = ATTRIBUTES[effect.name]
-        value = model.values_of(effect)[size]
-        mjcf[effect.site][in_mjcf] = value
-        if in_urdf:
-            dynamics.setdefault(effect.site, {})[in_urdf] = value
+        value = model.values_of(effect)[effect.parameters[0].name]
+        mjcf[effect.site][MJCF[effect.name]] = value
+        if effect.name in FRICTION:
+            dynamics.setdefault(effect.site, {})[FRICTION[effect.name]] = value
     lines = [
         f'<joint name="{name}" '
         + ' '.join(f'{key}="{value:.6g}"' for key, value in values.items()) + '/>'

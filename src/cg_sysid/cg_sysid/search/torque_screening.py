@@ -199,13 +199,9 @@ def _as_predicted(
 class _Weightless(Urdf):
     """The joints of a robot without the bodies: what is left of its equations are the forces."""
 
-    def inverse_dynamics(self, q, v, a, p, up):
-        """Nothing has to be moved."""
-        return ca.SX.zeros(q.shape)
-
-    def mass_matrix(self, q, p):
-        """So that the equations can be written down."""
-        return ca.SX.eye(q.shape[0])
+    def recursion(self, q, v, a, p, up):
+        """Nothing has to be moved; a mass lets the equations be written down."""
+        return ca.SX.eye(q.shape[0]), ca.SX.zeros(q.shape)
 
     def energies(self, q, v, p, setup, up, foot=None):
         """None."""
