@@ -37,14 +37,14 @@ import resource
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from case_rows import known_rows, with_missing
 from foreign_laws import (
     FINE,
     FRICTIONS,
@@ -443,23 +443,10 @@ def version_of_sources() -> str:
     return digest.hexdigest()[:12]
 
 
-def known_rows(raw: Path, version: str | None) -> dict[str, dict[str, Any]]:
-    """Rows of a version, of the last one there by default, by case."""
-    if not raw.exists():
-        return {}
-    rows = [json.loads(line) for line in raw.read_text().splitlines()]
-    version = version or rows[-1]['version']
-    return {row['case']: row for row in rows if row['version'] == version}
-
-
-def carried_out(
-    cases: list[Case], version: str, workers: int, limit: float
-) -> Iterator[dict[str, Any]]:
-    """Rows as they come."""
-    with ProcessPoolExecutor(workers, max_tasks_per_child=1) as pool:
-        futures = [pool.submit(run, case, version, limit) for case in cases]
-        for future in as_completed(futures):
-            yield future.result()
+def told(row: dict[str, Any]) -> str:
+    """A row for the screen."""
+    words = row['case'], *row['laws'], '->', row['verdict'], *row['causes']
+    return ' '.join([*words, '' if is_right(row) else 'WRONG', str(row.get('cpu_s', ''))])
 
 
 def main() -> int:
@@ -484,22 +471,9 @@ def main() -> int:
         return 0
     chosen = sampled(cases, options.sample) if options.sample else cases
     rows = known_rows(options.raw, None if options.table_only else version)
-    missing = [case for case in chosen if case.name not in rows and not options.table_only]
-    options.raw.parent.mkdir(parents=True, exist_ok=True)
-    for done, row in enumerate(carried_out(missing, version, options.workers, options.limit), 1):
-        rows[row['case']] = row
-        with options.raw.open('a') as raw:
-            raw.write(json.dumps(row) + '\n')
-        print(
-            f'{done}/{len(missing)}',
-            row['case'],
-            *row['laws'],
-            '->',
-            row['verdict'],
-            *row['causes'],
-            '' if is_right(row) else 'WRONG',
-            row.get('cpu_s', ''),
-            flush=True,
+    if not options.table_only:
+        rows = with_missing(
+            rows, chosen, run, version, options.raw, options.workers, options.limit, told
         )
     made = [rows[case.name] for case in chosen if case.name in rows]
     if not made:

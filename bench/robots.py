@@ -34,14 +34,13 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from case_rows import known_rows, with_missing
 from outside import cpu_seconds, version_of_sources, wilson
 from robots_machines import EFFECTS, ROBOTS, Robot, Secret, record, right, sites, with_small_faults
 from rosbags.typesys import Stores, get_typestore
@@ -366,22 +365,10 @@ def version() -> str:
     return digest.hexdigest()[:12]
 
 
-def known_rows(raw: Path, wanted: str | None) -> dict[str, dict[str, Any]]:
-    """Rows by case: of a version, or by default the last of each case."""
-    if not raw.exists():
-        return {}
-    rows = [json.loads(line) for line in raw.read_text().splitlines()]
-    return {row['case']: row for row in rows if wanted in (None, row['version'])}
-
-
-def carried_out(
-    cases: list[Case], version: str, workers: int, limit: float
-) -> Iterator[dict[str, Any]]:
-    """Rows as they come."""
-    with ProcessPoolExecutor(workers, max_tasks_per_child=1) as pool:
-        futures = [pool.submit(run, case, version, limit) for case in cases]
-        for future in as_completed(futures):
-            yield future.result()
+def told(row: dict[str, Any]) -> str:
+    """A row for the screen."""
+    words = row['case'], row['site'], '->', row['verdict'], *row['causes']
+    return ' '.join([*words, '' if is_right(row) else 'WRONG', f'{row["cpu_s"]} s'])
 
 
 def main() -> int:
@@ -394,7 +381,7 @@ def main() -> int:
     parser.add_argument('--limit', type=float, default=LIMIT, help=f'CPU s a case [{LIMIT:g}]')
     parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'robots.jsonl')
     parser.add_argument('--write', type=Path)
-    parser.add_argument('--table-only', action='store_true', help='of the last rows in --raw')
+    parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     options = parser.parse_args()
     of, cases = version(), programme()
     if options.case:
@@ -414,16 +401,10 @@ def main() -> int:
         cases = [case for case in cases if case.robot == options.robot]
     chosen = sampled(cases, options.sample) if options.sample else cases
     rows = known_rows(options.raw, None if options.table_only else of)
-    missing = [case for case in chosen if case.name not in rows and not options.table_only]
-    options.raw.parent.mkdir(parents=True, exist_ok=True)
-    for done, row in enumerate(carried_out(missing, of, options.workers, options.limit), 1):
-        rows[row['case']] = row
-        with options.raw.open('a') as raw:
-            raw.write(json.dumps(row) + '\n')
-        print(
-            f'{done}/{len(missing)}', row['case'], row['site'], '->', row['verdict'],
-            *row['causes'], '' if is_right(row) else 'WRONG', row['cpu_s'], flush=True,
-        )  # fmt: skip
+    if not options.table_only:
+        rows = with_missing(
+            rows, chosen, run, of, options.raw, options.workers, options.limit, told
+        )
     shown = [rows[case.name] for case in chosen if case.name in rows]
     if not shown:
         print('no rows of these sources', file=sys.stderr)
@@ -431,12 +412,11 @@ def main() -> int:
     lines = [*table_of(shown), '', *every_one(shown)]
     print('\n'.join(lines))
     if options.write:
-        versions = ', '.join(dict.fromkeys(row['version'] for row in shown))
         drawn = f', {len(shown)} of them run' if len(shown) < len(cases) else ''
         options.write.write_text('\n'.join([
             '# Robots of a URDF that share no code with the models', '',
             'Command: `./cg exec python bench/robots.py`; this table of its rows: the same with '
-            f'`--table-only --write FILE`. Sources {versions}.',
+            f'`--table-only --write FILE`. Sources {shown[0]["version"]}.',
             f'The programme: {len(cases)} cases{drawn}. What is right is written at the head of '
             'the bench, and was settled before any case was run.', '', *lines, '',
         ]))  # fmt: skip

@@ -46,10 +46,10 @@ def nominal() -> Model:
     return model
 
 
-def recorded(model: Model, seconds: float, seed: int) -> Record:
+def recorded(model: Model, seconds: float, seed: int, setup: Setup = Setup()) -> Record:  # noqa: B008
     """The model follows smooth ways by a controller that knows nothing of it."""
     random = np.random.default_rng(seed)
-    compiled, p = compile_model(model, Setup()), parameter_vector(model, Setup())
+    compiled, p = compile_model(model, setup), parameter_vector(model, setup)
     n = len(model.mechanism.coordinates)
     w, phase = 2 * np.pi * random.uniform(0.2, 1.3, (n, 4)), random.uniform(0, 6, (n, 4))
     time = np.arange(round(seconds / SAMPLE) + 1) * SAMPLE
@@ -72,4 +72,5 @@ def recorded(model: Model, seconds: float, seed: int) -> Record:
         inputs=dict(zip(body.inputs, torques.T[:n], strict=True)),
         outputs=dict(zip(body.outputs, seen.T, strict=True)),
         mechanism=channels.interface(body),
+        setup=setup,
     )  # fmt: skip

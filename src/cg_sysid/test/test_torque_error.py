@@ -85,12 +85,17 @@ def test_a_sound_robot_has_little_to_look_at(believed):
     found = scores(believed, train, candidates_for(believed, [Setup()]), {})
     # The bias of smoothing is no noise: a few laws gain by it, none by much.
     assert np.median(list(found.gains.values())) < SEEN
+    assert max(found.fitted.values()) < 10 * SEEN
 
 
 def test_records_are_followed_as_far_as_the_torques_are_right(believed):
-    right = [recorded(believed, 6.0, 1)]
-    lacking = [
-        recorded(believed.with_effect('torque_constant', 'thigh_joint', error=-0.4), 6.0, 1)
+    hanging = followed(believed, [recorded(believed, 6.0, 1)])[0]
+    assert hanging.whole
+    # On its head gravity lets errors grow, and a drive that is wrong leaves torques unexplained.
+    upside_down = Setup(gravity=(0.0, 0.0, 1.0))
+    weak = believed.with_effect('torque_bias', 'thigh_joint', bias=1.5)
+    cuts = [
+        len(followed(believed, [recorded(model, 6.0, 1, upside_down)])[0].cuts)
+        for model in (believed, weak)
     ]
-    cuts = [len(followed(believed, records)[0].cuts) for records in (right, lacking)]
-    assert cuts[0] <= cuts[1]
+    assert 0 < cuts[0] < cuts[1]

@@ -75,7 +75,10 @@ class TorqueFit:
 
 
 def can(model: Model) -> bool:
-    """Whether every coordinate of a model is measured by an encoder of its own."""
+    """Whether this is of use: a robot of a URDF with an encoder at every joint that moves.
+
+    Mechanisms of a few joints are followed by simulation from the start.
+    """
     encoders = sum(kind == 'encoder' for kind in model.mechanism.sensor_kinds.values())
     return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import assemble, parameter_vector
+from cg_dynamics.assemble import assemble, overrides, parameter_vector
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.mechanisms.urdf import Urdf
@@ -41,7 +41,6 @@ FITTED = 30  # candidates that are fitted by torque, the best first
 KEPT = 12  # of these, that are looked at
 NEAR = 0.2  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
-STEP = 1e-4  # relative, of differences of inputs in time
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def scores(
         gains[name, at] = best
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
     by_fit = {c: _gain_by_fit(plain, c, train, bounds, fitted) for c in follow}
-    noise = _noise(model, train, problems, values, by_motion)
+    noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = [name for name in model.mechanism.kinematics(train[0].setup).names]
     return Scores(gains, by_fit, tuple(free[k] for k in order))
@@ -218,7 +217,8 @@ def _columns(
     """D of a candidate at each of its starts, (rows, m, numbers); None where it has none."""
     kind = LIBRARY[name]
     effect = kind(model.mechanism, at)
-    if effect.states or set(effect.extra_inputs) & set(CLOCKS) or name == 'ground_slope':
+    # Without bodies gravity pulls at nothing: what turns it has no D either.
+    if effect.states or set(effect.extra_inputs) & set(CLOCKS) or overrides(effect, 'up'):
         return None
     if any(p.each == 'record' for p in effect.parameters):
         return None
@@ -309,17 +309,11 @@ def _by_motion(problem: Problem, model: Model) -> np.ndarray:
     return found.reshape(m, k, 3 * m).transpose(1, 0, 2)
 
 
-def _noise(
-    model: Model,
-    train: Sequence[DataSet],
-    problems: Sequence[Problem],
-    values: Model,
-    by_motion: Sequence[np.ndarray],
-) -> np.ndarray:
+def _noise(data_set: DataSet, by_motion: Sequence[np.ndarray]) -> np.ndarray:
     """Torque error that the noise of the encoders makes, for each coordinate, N m (N)."""
     m = by_motion[0].shape[1]
-    sigma = train[0].sigma[:m]
-    spacing = float(np.median(np.diff(train[0].time)))
+    sigma = data_set.sigma[:m]
+    spacing = float(np.median(np.diff(data_set.time)))
     gains = torque_error.noise_gains(spacing)
     spread = np.concatenate([gain * sigma for gain in gains])
     return np.sqrt(np.mean(np.vstack([(b**2) @ spread**2 for b in by_motion]), axis=0))
