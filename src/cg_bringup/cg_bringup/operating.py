@@ -101,15 +101,18 @@ def go_through(robot: Robot, settings: TaskSettings) -> int:
     file = record.path_in(Path(settings.checklists), begun['date'])
     results: list[Result] = []
 
+    def so_far() -> record.Record:
+        complete = len(results) == len(steps)
+        return record.Record(**begun, complete=complete, steps=tuple(results))
+
     def keep(result: Result) -> None:
         results.append(result)
         robot.say(f'{len(results)}/{len(steps)} {result.line}')
-        complete = len(results) == len(steps)
-        record.Record(**begun, complete=complete, steps=tuple(results)).save(file)
+        so_far().save(file)
 
-    record.Record(**begun, complete=False, steps=()).save(file)
+    so_far().save(file)
     walk(robot, plan, steps, settings.go_on, keep)
-    robot.say(f'{record.Record(**begun, complete=True, steps=results).line}\n{file}')
+    robot.say(f'{so_far().line}\n{file}')
     return 1 if any(result.verdict == FAILED for result in results) else 0
 
 
