@@ -133,8 +133,8 @@ class ModelSelection:
         fine = settings.SELECTION.thorough_fidelity if to_all else settings.SELECTION.fidelity
         fidelity = fine if white else settings.SELECTION.rough_fidelity
         margin = max(settings.SELECTION.margin, fidelity * independent / 2)
-        if (at_noise(base) and not self.imitated(base)) or self.only_beliefs(base):
-            # Beliefs decide, and those are rough: whatever relieves them is a rival.
+        if self._beliefs_decide(base):
+            # Beliefs do, and those are rough: whatever relieves them is a rival.
             margin = float('inf')
         return Comparison(base, tuple(ranked), independent, margin)
 
@@ -150,7 +150,7 @@ class ModelSelection:
         if gained < settings.SELECTION.earned:
             reasons.append(f'evidence {gained:.1f} nats, {settings.SELECTION.earned:g} needed')
         imitated = self.imitated(base)
-        if (at_noise(base) and not imitated) or self.only_beliefs(base):
+        if self._beliefs_decide(base):
             # No error is left to explain, but numbers that nobody believes.
             if prior_conflicts(o) or not (at_noise(o) or self._as_good(base, o)):
                 reasons.append('leaves numbers far from what the model file believes')
@@ -233,6 +233,10 @@ class ModelSelection:
         What takes their place, as a payload that of an arm too heavy, lowers no error.
         """
         return bool(prior_conflicts(o)) and _immaterial(o)
+
+    def _beliefs_decide(self, base: Outcome) -> bool:
+        """True if no error of a base is left to explain."""
+        return (at_noise(base) and not self.imitated(base)) or self.only_beliefs(base)
 
     def _as_good(self, base: Outcome, o: Outcome) -> bool:
         """Whether an outcome leaves no more than its base, as far as fits can tell."""
