@@ -87,7 +87,11 @@ def test_a_size_that_is_not_determined_is_no_cause(nominal):
 
 @pytest.mark.parametrize(
     ('sigma', 'told'),
-    [(0.2, 'distance not determined'), (0.05, 'distance = 0.170 \u00b1 0.050 m')],
+    [
+        (0.2, 'distance not determined'),
+        (float('inf'), 'distance not determined'),
+        (0.05, 'distance = 0.170 \u00b1 0.050 m'),
+    ],
 )
 def test_a_place_is_told_where_the_interval_tells_one(sigma, told):
     """Payloads are sought 0.2, 0.6 and 1 m from the joint: +- 0.4 m holds two of these."""

@@ -168,15 +168,18 @@ def _told(cause: Cause, name: str) -> str:
 
 
 def is_determined(label: str, name: str, sigma: float) -> bool:
-    """Whether the 95 % interval of a place on a body tells where it is.
+    """Whether the records say anything of a parameter: not if its interval has no end.
 
-    It does if it is no wider than what lies between two of the places from which it is sought.
+    Of a place on a body the 95 % interval also has to tell where it is: it does if it is no wider
+    than what lies between two of the places from which it is sought.
 
     Args:
         label: Of the effect.
         name: Of its parameter; all that are no places, sizes among them, count as determined.
         sigma: Standard deviation in its unit.
     """
+    if not np.isfinite(sigma):
+        return False
     kind = LIBRARY.get(effect_name(label))
     declared = {p.name: p for p in kind.parameters}.get(name) if kind else None
     if declared is None or declared.neutral is not None or declared.logarithmic:
