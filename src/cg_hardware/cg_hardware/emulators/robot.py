@@ -122,6 +122,7 @@ class EmulatedRobot:
         self._bad_samples = self._bad_frames = '', 0  # kind, and how many more
         self.begun = time.monotonic()  # instant of time zero
         self.trace: TextIO | None = None
+        self._samples: list[tuple[float, bytes, float]] = []  # not due yet: s, bytes, pitch in rad
         self._unsent: list[tuple[int, float]] = []  # samples: instant in ns, pitch in rad
         self._told = 0
         self.farthest = self.late = 0.0
@@ -149,7 +150,7 @@ class EmulatedRobot:
         return float(self._plant.state[STANCES.index(self._plant.stance)])
 
     def move(self) -> None:
-        """Move the body on by STEP, and take the IMU's sample that is due."""
+        """Move the body on by STEP, to where it is next; what is sampled there is due then."""
         enabled = self.drive.state == 'operation enabled'
         if enabled and not self._enabled:
             self._held = False
@@ -179,9 +180,9 @@ class EmulatedRobot:
             rates = (0.0, outputs['imu_rate'], 0.0)
             roll, yaw = GIMBAL
             sample = self.imu.sample(self.now, roll, outputs['imu_angle'], yaw, rates)
-            self._waiting += self._on_a_bad_line(sample)
-            if sample and self.trace is not None:
-                self._unsent.append((self.epoch_ns + round(1e9 * self.now), outputs['imu_angle']))
+            if sample:
+                on_line = self._on_a_bad_line(sample)
+                self._samples.append((self.now, on_line, outputs['imu_angle']))
 
     @property
     def _angles(self) -> dict[str, float]:
@@ -230,8 +231,8 @@ class EmulatedRobot:
         Args:
             now: Time in s since the start.
         """
-        # The encoder is read at the SYNC, between two steps of the body.
-        hip = self._hip + self._hip_rate * min(max(now - self.now, 0.0), STEP)
+        # The encoder is read at the SYNC, between two steps of the body; the next one is known.
+        hip = self._hip + self._hip_rate * min(max(now - self.now, -STEP), STEP)
         self.drive.counts = SHELL + round(hip / self._count)
         self._serve_can(now)
         self._serve_imu(now)
@@ -271,8 +272,14 @@ class EmulatedRobot:
             self.trace.write(f'sync {time.time_ns()} {self.drive.acting}\n')
 
     def _serve_imu(self, now: float) -> None:
+        due = [sample for sample in self._samples if sample[0] <= now]
+        del self._samples[: len(due)]
         if self.imu_line is None:
             return
+        self._waiting += b''.join(sent for _, sent, _ in due)
+        if self.trace is not None:
+            epoch_ns = self.epoch_ns
+            self._unsent += [(epoch_ns + round(1e9 * at), pitch) for at, _, pitch in due]
         self._waiting += self.imu.receive(self.imu_line.read(), now)
         if 'imu' in self._silent:
             self._waiting = b''
