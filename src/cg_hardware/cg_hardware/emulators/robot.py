@@ -124,7 +124,6 @@ class EmulatedRobot:
         self.trace: TextIO | None = None
         self._samples: list[tuple[float, bytes, float]] = []  # not due yet: s, bytes, pitch in rad
         self._unsent: list[tuple[int, float]] = []  # samples: instant in ns, pitch in rad
-        self._told = 0
         self.farthest = self.late = 0.0
         self.ticks = 0
 
@@ -382,7 +381,8 @@ class EmulatedRobot:
         return ''
 
     def _report(self) -> str:
-        changes, self._told = self.drive.log[self._told :], len(self.drive.log)
+        changes = self.drive.log.copy()
+        self.drive.log.clear()
         late, self.late = self.late, 0.0
         return json.dumps({
             'time': self.now, 'epoch_ns': self.epoch_ns,
