@@ -241,7 +241,7 @@ class Rig:
         person = self.person
         person.press('/drive/disable')
         self.robot.ask('stand')
-        person.until(self._is_in_place)
+        person.until(lambda: self._is_in_place() and 'balance' in person.said)
         if 'fallen' in person.said['balance'][1]:
             person.set('/balance', 'armed', False)
             person.set('/balance', 'armed', True)

@@ -199,6 +199,37 @@ def test_a_drive_that_falls_silent_is_given_up(robot, drive):
     assert not drive.wanted
 
 
+def test_garbage_between_frames_costs_at_most_a_frame(robot, drive):
+    enabled(drive, 4.0)
+    drive.answers.clear()
+    for _ in range(20):
+        robot.ask('can_garbage 40')  # nearly always with bytes that are no text
+        spin(drive, 0.02, 4.0)
+    assert drive.reason in ('', *HELD_UP)
+    assert len(drive.answers) > 100  # of 200
+    robot.ask('can_garbage 1000')
+    drive.answers.clear()
+    assert spin(drive, 2.0, 4.0, lambda: len(drive.answers) > 20)
+
+
+def test_noise_on_the_line_is_a_silent_drive_and_can_end(robot, drive):
+    for _ in range(5):  # a busy machine is late by itself
+        enabled(drive, 4.0)
+        spin(drive, 0.1, 4.0)
+        before = robot.report()
+        robot.ask('can_noise 1000000000')
+        assert spin(drive, 1.0, 4.0, lambda: not drive.wanted)
+        spin(drive, 0.05, 4.0)
+        report = robot.report()
+        robot.ask('can_noise 0')
+        assert spin(drive, 2.0, until=lambda: drive.state is not None)
+        took = report['changes'][-1][0] - before['time']
+        if took < AT_MOST + PERIOD:  # from a report, which is a cycle old at most
+            break
+    assert report['acting'] == 0
+    assert took < AT_MOST + PERIOD
+
+
 def test_a_drive_that_was_switched_off_is_set_up_anew(robot, drive):
     enabled(drive)
     robot.ask('drive_off')

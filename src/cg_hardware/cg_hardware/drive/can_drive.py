@@ -153,7 +153,7 @@ class CanDrive:
         self.scale = Scale(rated, sign)
 
     def _open(self, bus: dict) -> None:
-        self._network = canopen.Network()
+        self._network = _Network()
         # Any listener of python-can will do, whatever canopen's annotation says.
         self._network.listeners.append(_ReadErrors(self._network))  # type: ignore[arg-type]
         try:
@@ -356,20 +356,28 @@ class CanDrive:
         # Where the bus is gone the drive's own watch sees to it.
         gone = contextlib.suppress(can.CanError, OSError, RuntimeError)
         self.objects.close()
-        with gone:
-            self._network.send_message(0x200 + self.node, COMMAND.pack(0, 0))
-            self._network.send_message(SYNC, b'')
-            if self._mask:
-                self._network.send_message(0x300 + self.node, bytes(4))
+        last = [(0x200 + self.node, COMMAND.pack(0, 0)), (SYNC, b'')]
+        last += [(0x300 + self.node, bytes(4))] * bool(self._mask)
+        for cob, data in last:
+            with gone:  # each: a bus that cannot be read may still carry them
+                self._network.send_message(cob, data)
         with gone:
             self._network.disconnect()
+
+
+class _Network(canopen.Network):
+    """A network that outlives garbage on the line of a serial adapter: no error of the bus."""
+
+    def check(self) -> None:
+        """Raise what ended reception; what python-can could not decode did not."""
+        if self.notifier is not None and not _is_garbage(self.notifier.exception):
+            super().check()
 
 
 class _ReadErrors(can.Listener):
     """Errors of reading the bus: the next cycle meets them as well, and says so.
 
-    Garbage on the line of a serial adapter is no error of the bus. python-can would keep what it
-    cannot decode, and stumble over it at every frame from then on.
+    python-can would keep what it cannot decode, and stumble over it at every frame from then on.
     """
 
     def __init__(self, network: canopen.Network):
@@ -381,9 +389,15 @@ class _ReadErrors(can.Listener):
     def on_error(self, exc: Exception) -> None:
         """The thread that reads goes on, with a clean buffer where it has one."""
         flush = getattr(self._network.bus, 'flush', None)
-        if isinstance(exc, ValueError) and flush is not None:
+        if _is_garbage(exc) and flush is not None:
             with contextlib.suppress(can.CanError, OSError):
                 flush()
+
+
+def _is_garbage(error: Exception | None) -> bool:
+    """Whether it is about what is on the line: bytes that are no text, digits, or too few."""
+    cause = error and (error.__cause__ or error)  # python-can wraps some of them
+    return isinstance(cause, ValueError | IndexError)
 
 
 def told(bus: dict) -> str:
