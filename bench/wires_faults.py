@@ -45,7 +45,8 @@ AT_MOST = 20.0  # ms
 QUIET = 0.02  # s without torque that are no crossing of zero
 FALLEN = 0.2  # rad of lean beyond which it does not stand
 WATCH = 1.0  # s in which nothing may come back
-EARLIER = 0.5  # s before the fault from which the age of a torque is looked at
+EARLIER = 0.5  # s before the fault from which torques that stay are looked at
+LIMIT = 1000  # per mille of rated torque, at which a good torque may stay as well
 SOURCES = 'hardware', 'control', 'estimation', 'interfaces', 'bringup', 'dynamics'
 
 
@@ -77,7 +78,7 @@ def trial(it: Rig, fault: Fault, random: Random) -> dict[str, Any]:
         'stands': after['state'] == 'operation enabled' and abs(after['lean']) < FALLEN,
         'acting': after['acting'],
         'lean': round(after['lean'], 4),
-        'oldest_ms': oldest(changes, person.commands(), before, after, instant),
+        'held_ms': round(1e3 * longest_held(changes, instant - EARLIER, after['time']), 2),
         'late_ms': round(1e3 * after['late'], 2),
         'stage': person.stage,
         **fault.examine(it),
@@ -112,33 +113,23 @@ def longest_zero(changes: Changes, since: float, until: float) -> float:
     return max((b[0] - a[0] for a, b in spans if a[1] == 0), default=0.0)
 
 
-def oldest(
-    changes: Changes, commands: list[tuple[int, int]], before: dict, after: dict, instant: float
-) -> float | None:
-    """Greatest age in ms of a torque that acted, by the stamp of the command that asked for it.
+def longest_held(changes: Changes, since: float, until: float) -> float:
+    """Longest time in s for which one torque acted unchanged between two instants.
 
-    Of commands of the same torque the newest counts. None: some torque was nobody's.
+    A loop that lives asks for another torque in nearly every cycle. One that stays is old,
+    whatever its stamp says.
     """
-    stamps: dict[int, list[float]] = {}
-    for stamp_ns, torque in commands:
-        stamps.setdefault(torque, []).append((stamp_ns - after['epoch_ns']) * 1e-9)
-    rows = [*changes, (after['time'], 0)]
-    greatest = 0.0
-    for (begin, torque), (end, _) in itertools.pairwise(rows):
-        if torque == 0 or begin < max(before['time'], instant - EARLIER):
-            continue
-        asked = [s for s in stamps.get(torque, ()) if s <= end]
-        if not asked or min(asked) > begin:
-            return None
-        seen = [max(s for s in asked if s <= begin), *(s for s in asked if s > begin), end]
-        greatest = max(greatest, *(b - a for a, b in itertools.pairwise(seen)))
-    return round(1e3 * greatest, 2)
+    spans = itertools.pairwise([*changes, (until, 0)])
+    return max(
+        (b - max(a, since) for (a, torque), (b, _) in spans if 0 < abs(torque) < LIMIT),
+        default=0.0,
+    )
 
 
 def is_right(fault: Fault, row: dict[str, Any]) -> bool:
     """Whether all is as the class has it."""
     off = row['zero_ms'] is not None and row['zero_ms'] <= AT_MOST
-    fresh = row['oldest_ms'] is not None and row['oldest_ms'] <= AT_MOST
+    fresh = row['held_ms'] <= AT_MOST
     if fault.expects == 'zero':
         return off and not row['back']
     if fault.expects == 'rule':
@@ -246,7 +237,7 @@ HEADS = {
     'zero': ('fault', *COMMON, 'zero after, ms: median', '95 %', 'worst', 'later than 20 ms',
              'came back', *LAST),
     'balance': ('fault', *COMMON, 'fell', 'longest without torque, ms', *LAST),
-    'either': ('fault', *COMMON, 'stands', 'torque is zero', 'oldest torque, ms', *LAST),
+    'either': ('fault', *COMMON, 'stands', 'torque is zero', 'one torque stays, ms', *LAST),
 }  # fmt: skip
 
 
@@ -276,9 +267,9 @@ def lines_of(
                 f'{max(r["longest_without_ms"] for r in own):.0f}',
             ]
         else:
-            ages = [np.inf if r['oldest_ms'] is None else r['oldest_ms'] for r in own]
+            longest = max(r['held_ms'] for r in own)
             stands = sum(r['stands'] for r in own)
-            cells += [stands, sum(r['acting'] == 0 for r in own), f'{max(ages):.1f}']
+            cells += [stands, sum(r['acting'] == 0 for r in own), f'{longest:.1f}']
         spent_s = sum(row['took_s'] for row in every)
         cells += [
             len(every) - len(own), sum(row.get('robots', 0) for row in every),
@@ -289,7 +280,7 @@ def lines_of(
 
 def wrong_ones(rows: list[dict[str, Any]]) -> Iterator[str]:
     """What is not as it should be, trial by trial, and what was thrown away, by reason."""
-    said = ('zero_ms', 'back', 'stands', 'acting', 'oldest_ms', 'stage', 'status', 'errors',
+    said = ('zero_ms', 'back', 'stands', 'acting', 'held_ms', 'stage', 'status', 'errors',
             'sizes')  # fmt: skip
     wrong = [row for row in rows if row['counts'] and not is_right(FAULTS[row['class']], row)]
     for row in wrong:

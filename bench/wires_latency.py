@@ -40,7 +40,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, JointState
-from wires_rig import DEVICES, NODES, PER_MILLE, ROOT, START, Lost, go_first, rig
+from wires_rig import DEVICES, NODES, ROOT, START, Lost, go_first, rig
 
 from cg_bringup.balance_run import MACHINE, BalanceOptions, balance_nodes
 from cg_bringup.supervisor import supervised
@@ -66,6 +66,7 @@ STAMP = struct.Struct('<iI')
 HEADER = 4  # bytes before the stamp of a message
 PERIOD = 0.002  # s
 LOST = 0.05  # s after which a command cannot act any more
+PER_MILLE = 25.0  # per mille of the drive's rated torque in 1 N m
 AIM = 0.2  # ms: jitter of the stamps
 QUANTILES = (0.5, 0.95, 0.999, 1.0)
 

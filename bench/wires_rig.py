@@ -2,12 +2,9 @@
 
 One robot is started, and serves as long as a person can make it stand again: hold it, reset, take
 the zero where the drive was lost, arm, enable, let go. Nodes that were killed are started again.
-The person also hears every torque command, so that the age of a torque that acts can be told from
-the drive's side.
 """
 
 import contextlib
-import math
 import os
 import select
 import signal
@@ -15,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -26,8 +22,6 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
@@ -42,16 +36,13 @@ from cg_bringup.runs import NodeOf  # noqa: E402
 from cg_bringup.supervisor import Supervisor, supervised  # noqa: E402
 from cg_interfaces import topics  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
-from cg_interfaces.ros import MACHINE_QOS, to_nanoseconds  # noqa: E402
 
 START = (0.03, 0.03)  # rad of the legs when a person lets go
 PATIENCE = 60.0  # s for a robot to stand, from cold
 UPRIGHT = 0.03  # rad of lean that is standing still
 TRIES = 6
 ANSWER = 3.0  # s for a service, before it is called once more
-PER_MILLE = 25.0  # per mille of the drive's rated torque in 1 N m
 DEVICES, NODES = 20, 10  # real-time priorities of a robot that goes first
-KEPT = 10_000  # commands, 20 s
 
 
 class Lost(RuntimeError):
@@ -59,7 +50,7 @@ class Lost(RuntimeError):
 
 
 class Operator(Person):
-    """A person who knows what to press, and hears commands and diagnostics.
+    """A person who knows what to press, and hears diagnostics.
 
     Attributes:
         said: Name in /diagnostics -> when it was heard last (monotonic, s), its line, its figures.
@@ -67,12 +58,8 @@ class Operator(Person):
 
     def __init__(self) -> None:
         super().__init__()
-        self._commands: deque[bytes] = deque(maxlen=KEPT)
         self.said: dict[str, tuple[float, str, dict[str, str]]] = {}
         node = self.node
-        node.create_subscription(
-            JointState, topics.TORQUE_COMMAND, self.on_command, MACHINE_QOS, raw=True
-        )
         node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self.on_diagnostics, 50)
         self.stop = node.create_publisher(Bool, topics.EMERGENCY_STOP, 10)
         self._clients = {
@@ -84,10 +71,6 @@ class Operator(Person):
         self._settings: dict[str, Client] = {}
         self._executor = EventsExecutor()
         self._executor.add_node(node)
-
-    def on_command(self, message: bytes) -> None:
-        """Keep a torque command, to be read when it matters."""
-        self._commands.append(message)
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep what each said last."""
@@ -130,14 +113,6 @@ class Operator(Person):
         self.until(client.service_is_ready)
         parameter = Parameter(name, value=value).to_parameter_msg()
         self.until(client.call_async(SetParameters.Request(parameters=[parameter])).done)
-
-    def commands(self) -> list[tuple[int, int]]:
-        """Stamp in ns and torque in per mille of rated of the commands that were heard."""
-        heard = [deserialize_message(data, JointState) for data in self._commands]
-        return [
-            (to_nanoseconds(m.header.stamp), round(PER_MILLE * m.effort[0]))
-            for m in heard if len(m.effort) == 1 and math.isfinite(m.effort[0])
-        ]  # fmt: skip
 
 
 class Rig:
