@@ -164,6 +164,8 @@ def compiled(robot: Robot, secret: Secret, step: float) -> mujoco.MjModel:
     if secret.payload:
         link, mass, place = secret.payload
         load = spec.body(link).add_body(name='payload', pos=place)
+        # Without a place of its own, the centre would be put at `pos` once more.
+        load.ipos, load.iquat = [0, 0, 0], [1, 0, 0, 0]
         load.mass, load.inertia, load.explicitinertial = mass, [POINT] * 3, True
     if secret.rotor:
         rotor = spec.worldbody.add_body(name='rotor')

@@ -70,6 +70,7 @@ def compiled(urdf: str, secret: Secret) -> 'mujoco.MjModel':
     if secret.payload:
         link, mass, place = secret.payload
         load = spec.body(link).add_body(name='payload', pos=place)
+        load.ipos, load.iquat = [0, 0, 0], [1, 0, 0, 0]  # by default once more where the body is
         load.mass, load.inertia, load.explicitinertial = mass, [1e-9, 1e-9, 1e-9], True
     for joint in spec.joints:
         joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -3,12 +3,22 @@
 import numpy as np
 import pytest
 
+from hanging_arm import nominal, recorded
+
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.identification.identify import fit
-from cg_sysid.identification.simulation_error import Border, Point, reduced
+from cg_sysid.identification.identify import _guesses, fit
+from cg_sysid.identification.simulation_error import (
+    Border,
+    Point,
+    Problem,
+    evaluate,
+    reduced,
+    simulate_sensitive,
+)
+from cg_sysid.identification.unknowns import unknowns_of
 
 
 def _point(own_hessian, coupling, own_gradient):
@@ -27,6 +37,26 @@ def test_reduced_is_the_schur_complement():
     step = np.linalg.solve(whole, np.append(g, 3.0))[2]
     # Both are solves of a matrix with condition 1e7: nine digits are left of sixteen.
     assert (gradient / h[0, 0])[0] == pytest.approx(step, rel=1e-9)
+
+
+def test_a_robot_without_a_border_of_consistency_has_the_curvature_of_its_sensitivities():
+    believed = nominal()
+    data_sets = prepare(believed, [recorded(believed, 2.0, 1)])
+    unknowns = unknowns_of(believed)
+    problem = Problem(believed, data_sets, unknowns, _guesses(believed, data_sets, {}), 1.0)
+    values = np.array([u.prior for u in unknowns])
+    theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
+    motion = problem.guesses[0]
+    point = evaluate(problem, theta, [motion], np.inf, 1.0)
+    _, _, _, jacobian = simulate_sensitive(problem, 0, values, motion, np.inf, keep=True)
+    shared = jacobian[:, :, len(motion) :] / data_sets[0].sigma[:, None] * problem.chain(values)
+    shared = shared.reshape(-1, len(unknowns))
+    belief = [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in unknowns]
+    expected = shared.T @ shared + np.diag(belief)
+    # Sums over 1000 samples in another order.
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((point.shared_hessian - expected) / size).max() < 1e-11
+    assert problem.consistency is None
 
 
 def test_a_direction_that_rounding_has_lost_is_no_failure():

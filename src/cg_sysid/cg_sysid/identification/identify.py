@@ -53,9 +53,9 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
-UPHILL = 1e3  # ratio of costs up to which a step uphill is followed by some across the valley
+UPHILL = 1e5  # ratio of costs up to which a step uphill is followed by some across the valley
 BACK = 5  # of these at most
-ACROSS = 1e-3  # damping of that: flat directions stay where they are
+ACROSS = 1e-6  # damping of that: the floor itself, a billionth as steep as its walls, stays as it is
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
@@ -277,7 +277,8 @@ def fit(
     problem = Problem(
         model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement
     )
-    if start is None and at is None and torque_error.can(model):
+    by_torque = start is None and torque_error.can(model)
+    if by_torque and at is None:
         found = torque_error.fit_by_torque(model, data_sets, only, bounds)
         at = found.values if found else None
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
@@ -294,6 +295,8 @@ def fit(
     end = _End.of(kept_fits.recall(place))
     if end is None:
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+        if by_torque and evaluate(problem, theta, motions, longest, weight) is not None:
+            stages = []  # the torques have led the way
         end = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
             reach, progress,

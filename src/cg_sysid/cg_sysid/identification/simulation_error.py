@@ -222,7 +222,7 @@ def evaluate(
     shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
     own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     cost = 0.0
-    border = Border(0.0, shared_g, shared_h)
+    border = Border(0.0, np.zeros(k), np.zeros((k, k)))
     ny = len(problem.data_sets[0].sigma)
     sse, count = np.zeros((len(problem.data_sets), ny)), np.zeros((len(problem.data_sets), ny))
     if problem.consistency is not None:

@@ -12,7 +12,7 @@ weights, so that both sides have seen the same window.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -151,14 +151,45 @@ def fit_by_torque(
             fits are compared; by default what is left of this one.
         at: Set out from these values (full name -> value) instead of those of the model.
     """
-    plain = without_states(model)
-    declared = plain.declarations
-    unknowns = tuple(u for u in unknowns_of(model, only, bounds) if u.name in declared)
-    problems = problems_of(plain, data_sets, unknowns)
+    found = fits_by_torque([model], data_sets, only, bounds, scale, at)
+    return found[0] if found else None
+
+
+def fits_by_torque(
+    models: Sequence[Model],
+    data_sets: Sequence[DataSet],
+    only: Sequence[str] | None = None,
+    bounds: Mapping[str, float] | None = None,
+    scale: np.ndarray | None = None,
+    at: Mapping[str, float] | None = None,
+) -> list[TorqueFit]:
+    """The same for models that differ in their values only, from each; none without a record."""
+    plain = [without_states(model) for model in models]
+    declared = plain[0].declarations
+    unknowns = [
+        tuple(u for u in unknowns_of(model, only, bounds) if u.name in declared)
+        for model in models
+    ]
+    problems = problems_of(plain[0], data_sets, unknowns[0])
     if not problems:
-        return None
+        return []
+    return [
+        _descend([problem.at(model) for problem in problems], own, scale, at or {})
+        for model, own in zip(plain, unknowns, strict=True)
+    ]
+
+
+def _descend(
+    problems: Sequence["Problem"],
+    unknowns: Sequence[Unknown],
+    scale: np.ndarray | None,
+    at: Mapping[str, float],
+) -> TorqueFit:
+    """From a start to the minimum: Gauss-Newton, damped."""
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
-    theta = np.array([u.to_coordinate((at or {}).get(u.name, u.prior)) for u in unknowns])
+    theta = np.array([
+        np.clip(u.to_coordinate(at.get(u.name, u.prior)), *_range(u)) for u in unknowns
+    ])  # fmt: skip
     tolerance = np.array([u.tolerance for u in unknowns])
     own_scale = scale is None
     residual, jacobian = evaluated(problems, unknowns, theta)
@@ -208,6 +239,10 @@ class Problem:
     vector: np.ndarray
     places: list[int]
     acted: np.ndarray
+
+    def at(self, model: Model) -> "Problem":
+        """The same with the values of a model of this structure."""
+        return replace(self, vector=parameter_vector(model, self.motion.setup))
 
 
 def problems_of(

@@ -14,6 +14,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import Failure
+from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
@@ -257,8 +258,16 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
 
 
 def shared_unknowns(found: Fit, bounds: Bounds) -> int:
-    """Number of values that all data sets of a fit share, less small faults."""
-    return sum(u.name not in bounds for u in found.unknowns)
+    """Number of values that all data sets of a fit share, less small faults.
+
+    And less those of which the records say nothing, as where across its plane an arm carries a
+    load: they explain nothing.
+    """
+    sigmas = found.sigmas
+    return sum(
+        u.name not in bounds and not np.isinf(s)
+        for u, s in zip(found.unknowns, sigmas, strict=True)
+    )
 
 
 def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
@@ -480,13 +489,15 @@ def _screened(
     only: Sequence[str] | None = None,
     start: Fit | None = None,
     length: float | None = None,
+    at: Mapping[str, float] | None = None,
+    iterations: int = settings.SCREENING.iterations,
 ) -> Fit:
     """A fit to an excerpt of the records: as long as the base's own look, if there is one."""
     few = [train[i] for i in excerpt.few(train)]
     return fit(
         model, few, only,
         horizon=task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0],
-        iterations=settings.SCREENING.iterations, start=start,
+        iterations=iterations, start=start, at=at,
         own=task.events, bounds=task.bounds, reach=task.reach, sure=False,
     )  # fmt: skip
 
@@ -536,20 +547,80 @@ def _swept(model: Model) -> list[str]:
 def _all_screened(
     task: Task, starts: Sequence[Start], train: Sequence[DataSet], kept: Sequence[str]
 ) -> list[tuple[Fit, Model]]:
-    """Short fits from each start and where they lead, best first; `kept` stay as they are."""
-    screenings = []
-    for model, start in starts:
-        moved = (u.name for u in unknowns_of(model, bounds=task.bounds))
-        only = [name for name in moved if name not in kept] if kept else None
+    """Short fits from each start and where they lead, best first; `kept` stay as they are.
+
+    Of many starts all go a few steps, and the best of them the rest of the way.
+    """
+    moved = (u.name for u in unknowns_of(starts[0][0], bounds=task.bounds))
+    only = [name for name in moved if name not in kept] if kept else None
+    led = _by_torque(task, starts, train, only)
+    if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
+        heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
+        ahead = heats[: settings.SCREENING.followed]
+        led = [((model, heat), None) for heat, model in ahead]
+    return [
+        (found, model.with_values(_numbers(found)))
+        for found, model in _short_fits(task, led, train, only, settings.SCREENING.iterations)
+    ]
+
+
+def _short_fits(
+    task: Task,
+    starts: Sequence[tuple[Start, Mapping[str, float] | None]],
+    train: Sequence[DataSet],
+    only: Sequence[str] | None,
+    iterations: int,
+) -> list[tuple[Fit, Model]]:
+    """Fits to an excerpt, with the models they set out from, best first.
+
+    Raises:
+        IdentificationError: none of them can be simulated.
+    """
+    found = []
+    for (model, start), at in starts:
         try:
-            screening = _screened(task, model, train, only, start)
-            found = {u.name: v for u, v in zip(screening.unknowns, screening.values, strict=True)}
-            screenings.append((screening, model.with_values(found)))
+            found.append(
+                (_screened(task, model, train, only, start, at=at, iterations=iterations), model)
+            )
         except IdentificationError as error:
             failure = error
-    if not screenings:
+    if not found:
         raise failure
-    return sorted(screenings, key=lambda pair: pair[0].normalised_error)
+    return sorted(found, key=lambda pair: pair[0].normalised_error)
+
+
+def _numbers(found: Fit) -> dict[str, float]:
+    return {u.name: float(v) for u, v in zip(found.unknowns, found.values, strict=True)}
+
+
+def _by_torque(
+    task: Task, starts: Sequence[Start], train: Sequence[DataSet], only: Sequence[str] | None
+) -> list[tuple[Start, Mapping[str, float] | None]]:
+    """Those of the starts that are worth a simulation, and what the torques say of each.
+
+    Starts from which torque fits come to one minimum are one; of an effect with states, of a
+    sensor or of time the torques know too little to tell its starts apart.
+    """
+    models = [model for model, _ in starts]
+    if any(start is not None for _, start in starts) or not torque_error.can(models[0]):
+        return [(start, None) for start in starts]
+    few = [train[i] for i in excerpt.few(train)]
+    # From where the base stands it is not far.
+    known = task.first or task.base
+    at = {u.name: v for u, v in zip(known.unknowns, known.values, strict=True)} if known else {}
+    found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at)
+    led = [(start, fitted.values) for start, fitted in zip(starts, found, strict=bool(found))]
+    kind = LIBRARY[task.effect[0]] if task.effect else None
+    if not found or kind is None or kind.states or kind.place in ('sensor', 'timing'):
+        return led or [(start, None) for start in starts]
+    own = f'{_label(task)}.'
+    told: list[int] = []
+    for k in sorted(range(len(found)), key=lambda k: found[k].cost):
+        numbers = [v for n, v in found[k].values.items() if n.startswith(own)]
+        others = ([v for n, v in found[i].values.items() if n.startswith(own)] for i in told)
+        if not any(np.allclose(numbers, o, rtol=settings.SCREENING.alike) for o in others):
+            told.append(k)
+    return [led[k] for k in told[: settings.SCREENING.followed]]
 
 
 def _starting_models(task: Task):

@@ -17,6 +17,7 @@ class Screening:
         enough_s: Length of short records that is enough, all together, in s.
         fewest_records: Short records from each set-up, at least.
         iterations: Of a first look.
+        heat: Of these, those that all starts of a candidate are given.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.
         following: Iterations of each of these on whole records, before the best of them is chosen.
@@ -28,6 +29,7 @@ class Screening:
     enough_s: float = 10.0
     fewest_records: int = 6
     iterations: int = 16
+    heat: int = 3
     most_starts: int = 24
     followed: int = 3
     following: int = 8

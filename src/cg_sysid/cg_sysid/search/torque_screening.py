@@ -35,7 +35,7 @@ from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search.candidates import starts_of
 from cg_sysid.search.nuisance import Bounds
 
-FEWEST_JOINTS = 3  # from which looks at all effects at all joints take too long
+FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
 FITTED = 30  # candidates that are fitted by torque, the best first
 KEPT = 12  # of these, that are looked at
@@ -68,7 +68,9 @@ class Scores:
         seen = sensed | {
             c
             for place, c in enumerate(ordered)
-            if self.fitted[c] > SEEN and (place < KEPT or self.fitted[c] > NEAR * best)
+            # Where numbers make up for each other a torque fit may stop in the valley.
+            if max(self.fitted[c], self.gains[c]) > SEEN
+            and (place < KEPT or self.fitted[c] > NEAR * best)
         }
         unseen = {
             (name, at)
