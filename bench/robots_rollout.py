@@ -24,18 +24,18 @@ import numpy as np
 from mujoco import rollout
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'src/cg_dynamics/test'))
-from random_trees import random_tree  # noqa: E402
+from random_trees import random_tree
 
-from cg_description.model_file import ModelFile  # noqa: E402
-from cg_dynamics.assemble import parameter_vector  # noqa: E402
-from cg_dynamics.model import Model  # noqa: E402
-from cg_dynamics.rig import Setup  # noqa: E402
-from cg_dynamics.rollout.compiled import compile_model  # noqa: E402
-from cg_interfaces import channels  # noqa: E402
-from cg_sysid.identification.data_set import prepare  # noqa: E402
-from cg_sysid.identification.simulation_error import Problem, simulate_sensitive  # noqa: E402
-from cg_sysid.identification.unknowns import unknowns_of  # noqa: E402
-from cg_sysid.records.record import Record  # noqa: E402
+from cg_description.model_file import ModelFile
+from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.compiled import compile_model
+from cg_interfaces import channels
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.simulation_error import Problem, simulate_sensitive
+from cg_sysid.identification.unknowns import unknowns_of
+from cg_sysid.records.record import Record
 
 JOINTS = 1, 2, 3, 6, 7
 SEED = 11

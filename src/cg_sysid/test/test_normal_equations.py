@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from hanging_arm import nominal, recorded
 
 from cg_dynamics.model import Model

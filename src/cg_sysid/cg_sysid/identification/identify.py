@@ -55,7 +55,9 @@ CENTRAL = 1e-2  # weight of the border of consistency over what is still to be g
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 UPHILL = 1e5  # ratio of costs up to which a step uphill is followed by some across the valley
 BACK = 5  # of these at most
-ACROSS = 1e-6  # damping of that: the floor itself, a billionth as steep as its walls, stays as it is
+ACROSS = (
+    1e-6  # damping of that: the floor itself, a billionth as steep as its walls, stays as it is
+)
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one

@@ -180,7 +180,7 @@ def fits_by_torque(
 
 
 def _descend(
-    problems: Sequence["Problem"],
+    problems: Sequence['Problem'],
     unknowns: Sequence[Unknown],
     scale: np.ndarray | None,
     at: Mapping[str, float],
@@ -240,7 +240,7 @@ class Problem:
     places: list[int]
     acted: np.ndarray
 
-    def at(self, model: Model) -> "Problem":
+    def at(self, model: Model) -> 'Problem':
         """The same with the values of a model of this structure."""
         return replace(self, vector=parameter_vector(model, self.motion.setup))
 

@@ -25,6 +25,7 @@ from cg_sysid.search.nuisance import Bounds, turning
 from cg_sysid.text import measured
 
 Start = tuple[Model, Fit | None]
+Led = tuple[Start, Mapping[str, float] | None]  # a start, and what torques say of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -566,7 +567,7 @@ def _all_screened(
 
 def _short_fits(
     task: Task,
-    starts: Sequence[tuple[Start, Mapping[str, float] | None]],
+    starts: Sequence[Led],
     train: Sequence[DataSet],
     only: Sequence[str] | None,
     iterations: int,
@@ -595,24 +596,27 @@ def _numbers(found: Fit) -> dict[str, float]:
 
 def _by_torque(
     task: Task, starts: Sequence[Start], train: Sequence[DataSet], only: Sequence[str] | None
-) -> list[tuple[Start, Mapping[str, float] | None]]:
+) -> list[Led]:
     """Those of the starts that are worth a simulation, and what the torques say of each.
 
     Starts from which torque fits come to one minimum are one; of an effect with states, of a
     sensor or of time the torques know too little to tell its starts apart.
     """
     models = [model for model, _ in starts]
+    led: list[Led] = [(start, None) for start in starts]
     if any(start is not None for _, start in starts) or not torque_error.can(models[0]):
-        return [(start, None) for start in starts]
+        return led
     few = [train[i] for i in excerpt.few(train)]
     # From where the base stands it is not far.
     known = task.first or task.base
     at = {u.name: v for u, v in zip(known.unknowns, known.values, strict=True)} if known else {}
     found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at)
-    led = [(start, fitted.values) for start, fitted in zip(starts, found, strict=bool(found))]
+    if not found:
+        return led
+    led = [(start, fitted.values) for start, fitted in zip(starts, found, strict=True)]
     kind = LIBRARY[task.effect[0]] if task.effect else None
-    if not found or kind is None or kind.states or kind.place in ('sensor', 'timing'):
-        return led or [(start, None) for start in starts]
+    if kind is None or kind.states or kind.place in ('sensor', 'timing'):
+        return led
     own = f'{_label(task)}.'
     told: list[int] = []
     for k in sorted(range(len(found)), key=lambda k: found[k].cost):
