@@ -52,6 +52,7 @@ TRAIN = ('20_02_05-20sec_8harm', '20_02_06-20sec_5harm', '20_02_06-20sec_10harm'
          '20_02_10-20sec_7harm')  # fmt: skip
 HELD = ('20_02_05-20sec_12harm', '20_02_10-30sec_12harm')
 UNLOADED, LOADED = ('20_01_31-unload',), ('20_01_31-load',)
+FLANGE, NUMBERS = 'wrist_3_link', ('mass', 'x', 'y', 'z')
 MOVES = 0.01  # rad/s
 TURNING = 0.02  # rad/s, over which dry friction turns
 
@@ -241,6 +242,9 @@ def main() -> None:
     )
     say(f'\nWith the load that the model of the unloaded arm does not know ({seconds:.0f} s):\n')
     say(loaded.summary)
+    hung = fit_by_torque(known.with_effect('payload', FLANGE, mass=1.0), sets[LOADED])
+    numbers = ', '.join(f'{k} = {hung.values[f"payload@{FLANGE}.{k}"]:.3g}' for k in NUMBERS)
+    say(f'\nA payload at {FLANGE} by torques alone: {numbers} (kg, m).')
     for cause in loaded.causes:
         told = ', '.join(f'{k} = {measured(*v)}' for k, v in cause.parameters.items())
         say(f'- {cause.label}: {told}')

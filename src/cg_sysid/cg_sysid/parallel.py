@@ -28,11 +28,19 @@ from typing import Any
 from cg_dynamics.watched_processes import end_with_spawner
 from cg_sysid.deadline import OutOfTime, check_time, current
 
+# Does independent pieces of work: (function, arguments of each, what) -> results.
+CarryOut = Callable[[Callable, list[tuple], str], list]
+
 POLL_S = 0.2  # between looks at a deadline
 
 _pool: ProcessPoolExecutor | None = None
 _knows_script = False  # whether the processes of the pool have run the script
 _threads: ContextVar[ThreadPoolExecutor | None] = ContextVar('threads', default=None)
+
+
+def one_by_one(function: Callable, arguments: list[tuple], what: str) -> list:
+    """The simplest way to carry work out: here, in order."""
+    return [function(*a) for a in arguments]
 
 
 def run_all(

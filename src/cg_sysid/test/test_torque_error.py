@@ -10,7 +10,7 @@ from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque
 from cg_sysid.identification.windows import followed
 from cg_sysid.search.candidates import candidates_for
-from cg_sysid.search.torque_screening import SEEN, scores, worth_a_look
+from cg_sysid.search.torque_screening import SEEN, scores
 
 OFF = {
     'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
@@ -75,7 +75,7 @@ def test_the_cause_is_worth_a_look(believed, name, at, sizes):
     train = data(true, believed)
     candidates = candidates_for(believed, [Setup()])
     assert (name, at) in candidates
-    kept = worth_a_look(believed, train, candidates, {})
+    kept = scores(believed, train, candidates, {}).worth(candidates)
     assert (name, at) in kept
     assert len(kept) < len(candidates) / 2
 

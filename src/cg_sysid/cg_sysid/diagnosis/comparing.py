@@ -12,7 +12,7 @@ from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
-from cg_sysid.search.torque_screening import worth_a_look
+from cg_sysid.search.torque_screening import scores
 
 
 def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Comparison:
@@ -26,9 +26,12 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
             base.model, work.setups(), work.options.effects, recorded,
             nuisances(base.model, bounds),
         )  # fmt: skip
-        effects = worth_a_look(base.train.model, work.train, effects, bounds)
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
+        said = scores(base.train.model, work.train, effects, bounds, work.carry_out)
+        if said is not None:
+            work.torques[key] = said
+            effects = said.worth(effects)
         base, task = led_deeper(work, base, effects, title)
         work.under_way = base
         outcomes: list[Outcome] = []

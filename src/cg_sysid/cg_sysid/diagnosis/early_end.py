@@ -41,7 +41,12 @@ def unfinished(work: Workspace, final: Outcome, left: bool) -> Unfinished:
     recorded = {name for data_set in work.train for name in data_set.input_names}
     possible = candidates_for(base.model, work.setups(), work.options.effects, recorded,
                               nuisances(base.model, base.bounds))  # fmt: skip
-    labels = {LIBRARY[name](base.model.mechanism, at).label for name, at in possible}
+    said = work.torques.get((work.added(work.under_way), bool(base.bounds)))
+    by_torques = () if said is None else tuple(
+        (label, nats) for c, nats in said.best()
+        if (label := _label(work, c)) not in looked | fitted | work.added(final)
+    )  # fmt: skip
+    labels = {_label(work, c) for c in (said.worth(possible) if said else possible)}
     ruled_out = {label for r in work.rounds for label in r.aside}
     ranking = [s for s in work.so_far.ranking(base) if s.label not in work.added(final)]
     steps = ['further causes'] if left else []
@@ -50,5 +55,10 @@ def unfinished(work: Workspace, final: Outcome, left: bool) -> Unfinished:
     return Unfinished(
         work.deadline.why, work.deadline.passed, tuple(ranking),
         tuple(sorted(looked - ruled_out)),
-        tuple(sorted(labels - looked - fitted - work.added(final))), tuple(steps),
+        tuple(sorted(labels - looked - fitted - work.added(final))), tuple(steps), by_torques,
     )  # fmt: skip
+
+
+def _label(work: Workspace, candidate: tuple[str, str | None]) -> str:
+    name, at = candidate
+    return LIBRARY[name](work.nominal.mechanism, at).label

@@ -20,6 +20,7 @@ from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.ranking import Round, per_output
 from cg_sysid.search.standings import SoFar, title_of
 from cg_sysid.search.successive_halving import SuccessiveHalving
+from cg_sysid.search.torque_screening import Scores
 
 Progress = Callable[[str, int, int, str], None]
 Structure = tuple[frozenset[str], frozenset[str]]  # labels of effects, names of small faults
@@ -42,6 +43,7 @@ class Workspace:
         halving: Fits candidates, the promising ones further.
         so_far: Who leads.
         comparisons: By the labels of what was added, and whether small faults are allowed for.
+        torques: What torques say of candidates, by the same.
         thorough: Thorough fits by structure.
         joint: Fits to all records, or why there is none.
         found: What stands, for an answer before the end.
@@ -68,6 +70,7 @@ class Workspace:
         self.halving = SuccessiveHalving(train, held, self.carry_out)
         self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         self.comparisons: dict[tuple[frozenset[str], bool], Comparison] = {}
+        self.torques: dict[tuple[frozenset[str], bool], Scores] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | Failure] = {}
         self.found: Outcome

@@ -304,6 +304,7 @@ def _unfinished(diagnosis: Diagnosis) -> Facts | None:
             {**_effect(s.label), 'in_noise': s.in_noise, 'whole_records': s.whole}
             for s in found.ranking
         ],
+        'by_torques': [{**_effect(label), 'nats': nats} for label, nats in found.by_torques],
         'not_fitted': list(found.not_fitted),
         'not_tried': list(found.not_tried),
         'not_done': list(found.steps),

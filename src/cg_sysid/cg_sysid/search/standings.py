@@ -8,7 +8,7 @@ import numpy as np
 
 from cg_sysid.search.candidates import Outcome, Screening, Task
 from cg_sysid.search.nuisance import nuisances
-from cg_sysid.text import listed, off_by
+from cg_sysid.text import listed, number, off_by
 
 NAMED = 3  # candidates that a sentence names
 Base = tuple[frozenset[str], bool]  # labels of effects, whether small faults are allowed for
@@ -44,6 +44,8 @@ class Unfinished:
         not_fitted: Labels of those that were not fitted to whole records.
         not_tried: Labels of those that were not even looked at.
         steps: What else was not done, in words.
+        by_torques: Labels of those that were not looked at but torques speak for, with the nats
+            that a torque fit gains, the best first (torque_screening.py).
     """
 
     why: str
@@ -52,6 +54,7 @@ class Unfinished:
     not_fitted: tuple[str, ...]
     not_tried: tuple[str, ...]
     steps: tuple[str, ...]
+    by_torques: tuple[tuple[str, float], ...] = ()
 
     @property
     def text(self) -> str:
@@ -60,6 +63,9 @@ class Unfinished:
         if self.ranking:
             best = '; '.join(map(str, self.ranking[:NAMED]))
             text += f' Candidates for what is left, the best first: {best}.'
+        if self.by_torques:
+            best = '; '.join(f'{label}, {number(n)} nats' for label, n in self.by_torques[:NAMED])
+            text += f' Torques alone, without a simulation, speak for {best}.'
         missing = [
             f'{what} of {_few(labels)}'
             for what, labels in (('whole fits', self.not_fitted), ('first looks', self.not_tried))

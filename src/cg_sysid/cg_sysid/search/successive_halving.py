@@ -12,7 +12,7 @@ off, so that a library of effects costs little more than those of them that matt
 """
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
+from cg_sysid.parallel import CarryOut
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
@@ -40,7 +41,6 @@ from cg_sysid.search.nuisance import nuisances
 log = logging.getLogger(__name__)
 
 
-CarryOut = Callable[[Callable, list[tuple], str], list]
 Effects = Sequence[tuple[str, str | None]]
 
 

@@ -32,14 +32,15 @@ from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.torque_error import Motion, Problem, TorqueFit
 from cg_sysid.identification.unknowns import unknowns_of
+from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search.candidates import starts_of
 from cg_sysid.search.nuisance import Bounds
 
 FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
-FITTED = 30  # candidates that are fitted by torque, the best first
-KEPT = 12  # of these, that are looked at
-NEAR = 0.2  # share of the best one's gain from which one is kept beyond these
+FITTED = 16  # candidates that are fitted by torque, the best first
+KEPT = 8  # of these, that are looked at
+NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
 
 
@@ -79,19 +80,10 @@ class Scores:
         }
         return [c for c in candidates if c in seen or c in unseen]
 
-
-def worth_a_look(
-    model: Model,
-    train: Sequence[DataSet],
-    candidates: Sequence[tuple[str, str | None]],
-    bounds: Bounds,
-) -> list[tuple[str, str | None]]:
-    """The candidates that the torques leave possible, of a robot of many joints; else all."""
-    several = len(model.mechanism.coordinates) >= FEWEST_JOINTS
-    if not several or not torque_error.can(model):
-        return list(candidates)
-    found = scores(model, train, candidates, bounds)
-    return found.worth(candidates) if found else list(candidates)
+    def best(self) -> list[tuple[tuple[str, str | None], float]]:
+        """Candidates that torque fits speak for, and their nats, the best first."""
+        ordered = sorted(self.fitted.items(), key=lambda item: -item[1])
+        return [(candidate, nats) for candidate, nats in ordered if nats > SEEN]
 
 
 def scores(
@@ -99,8 +91,16 @@ def scores(
     train: Sequence[DataSet],
     candidates: Sequence[tuple[str, str | None]],
     bounds: Bounds,
+    carry_out: CarryOut = one_by_one,
 ) -> Scores | None:
-    """What the torques say of candidates on top of a model; None where they say nothing."""
+    """What the torques say of candidates on top of a model.
+
+    Returns:
+        Their scores; None where torques say nothing, and of a robot of few joints, of which all
+        candidates can be looked at.
+    """
+    if len(model.mechanism.coordinates) < FEWEST_JOINTS or not torque_error.can(model):
+        return None
     plain = torque_error.without_states(model)
     declared = plain.declarations
     unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
@@ -138,7 +138,10 @@ def scores(
             best = max(best, float(left @ left - rest @ rest) / 2)
         gains[name, at] = best
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
-    by_fit = {c: _gain_by_fit(plain, c, train, bounds, fitted) for c in follow}
+    gained = carry_out(
+        _gain_by_fit, [(plain, c, train, bounds, fitted) for c in follow], 'what torques say'
+    )
+    by_fit = dict(zip(follow, gained, strict=True))
     noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = [name for name in model.mechanism.kinematics(train[0].setup).names]
@@ -163,15 +166,13 @@ def _gain_by_fit(
     small = any(effect.label == label for effect in model.effects)
     without = model.without_effect(label) if small else model
     own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
-    best = 0.0
-    for start in starts_of(name, model.mechanism):
-        extended = without.with_effect(name, at, **start)
-        found = torque_error.fit_by_torque(
-            extended, train, None, own, scale=base.scale, at=base.values
-        )
-        if found is not None:
-            best = max(best, (base.cost - found.cost) / 2)
-    return best
+    extended = [
+        without.with_effect(name, at, **start) for start in starts_of(name, model.mechanism)
+    ]
+    found = torque_error.fits_by_torque(
+        extended, train, None, own, scale=base.scale, at=base.values
+    )
+    return max(((base.cost - fitted.cost) / 2 for fitted in found), default=0.0)
 
 
 def _as_predicted(
