@@ -5,6 +5,8 @@ import pytest
 from hanging_arm import nominal, recorded
 
 from cg_dynamics.rig import Setup
+from cg_sysid.deadline import Deadline
+from cg_sysid.diagnosis.diagnose import Options, diagnose
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque
@@ -86,6 +88,27 @@ def test_a_sound_robot_has_little_to_look_at(believed):
     # The bias of smoothing is no noise: a few laws gain by it, none by much.
     assert np.median(list(found.gains.values())) < SEEN
     assert max(found.fitted.values()) < 10 * SEEN
+
+
+def test_torques_are_told_where_there_was_no_time_to_look(believed):
+    true = believed.with_values(OFF).with_effect('torque_bias', 'thigh_joint', bias=0.5)
+    deadline = Deadline()
+
+    def end_at_first_look(what, done, total, best):
+        if 'first look' in what:
+            deadline.ask()
+
+    found = diagnose(
+        believed, [recorded(true, 4.0, seed) for seed in (1, 2)],
+        Options(effects=('torque_bias', 'cogging_torque'), workers=0), end_at_first_look,
+        deadline=deadline,
+    ).unfinished  # fmt: skip
+    label, nats = found.by_torques[0]
+    assert label == 'torque_bias@thigh_joint'
+    assert nats > SEEN
+    assert f'Torques alone, without a simulation, speak for {label}' in found.text
+    # Of the others torques say that there is nothing in them.
+    assert 'torque_bias@hip_joint' not in found.not_tried
 
 
 def test_records_are_followed_as_far_as_the_torques_are_right(believed):
