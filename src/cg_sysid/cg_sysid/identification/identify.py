@@ -53,11 +53,7 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
-UPHILL = 1e5  # ratio of costs up to which a step uphill is followed by some across the valley
-BACK = 5  # of these at most
-ACROSS = (
-    1e-6  # damping of that: the floor itself, a billionth as steep as its walls, stays as it is
-)
+BACK = 5  # steps across a valley after one uphill, at most
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
@@ -66,6 +62,24 @@ HOPE = 10.0  # times that gain, within which it may still come there
 WHOLE = 'fitting whole records, in rounds until it settles'
 ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 Progress = Callable[[str, int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Valley:
+    """How far steps along a curved valley may leave its floor.
+
+    Attributes:
+        uphill: Ratio of costs up to which a step uphill is followed by some across the valley.
+        across: Damping of those: what is flatter, beside the walls, stays as it is.
+    """
+
+    uphill: float
+    across: float
+
+
+# A long step may leap over the minima of play: only a fit that is at its end takes those that a
+# valley needs whose floor is a billionth as steep as its walls, as of a load and what carries it.
+NEAR, FAR = Valley(1e3, 1e-3), Valley(1e5, 1e-6)
 
 
 @dataclass(frozen=True)
@@ -371,7 +385,7 @@ def _descend(
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
         found = _minimise(
             problem, found.theta, found.motions, longest, weight, at_once,
-            0.0 if thorough else DRIFT, reach,
+            0.0 if thorough else DRIFT, reach, valley=FAR if thorough else NEAR,
         )  # fmt: skip
         if found.point is None:
             raise IdentificationError(
@@ -420,6 +434,7 @@ def _minimise(
     drift: float,
     reach: float,
     leading: bool = False,
+    valley: Valley = NEAR,
 ) -> _Descent:
     lower = np.array(
         [
@@ -461,10 +476,10 @@ def _minimise(
             return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
         for _ in range(BACK):
-            if candidate is None or not point.cost < candidate.cost < UPHILL * point.cost:
+            if candidate is None or not point.cost < candidate.cost < valley.uphill * point.cost:
                 break
             # A step along a curved valley leaves its floor: back to it, across the valley.
-            back = ahead(trial_theta, trial_motions, candidate, max(ACROSS, damping))
+            back = ahead(trial_theta, trial_motions, candidate, max(valley.across, damping))
             if back[2] is None or back[2].cost > candidate.cost:
                 break
             trial_theta, trial_motions, candidate = back
