@@ -32,6 +32,8 @@ CHANNELS = {
 }
 DEVICES = ('imu', 'drive')
 
+TOLD_S = 2.5  # s in which devices tell of themselves: /diagnostics come once a second
+HEARD_S = 8.0  # s more that a busy computer is given for it
 OFF_RATE = 0.01  # of the stated rate
 MOST_MISSING = 0.01  # share of samples
 MOST_JITTER = 0.25  # of a period: spread of the periods
@@ -52,7 +54,8 @@ SCALE = 0.3  # share by which the encoder may miss the IMU
 
 def measure_devices(robot: Robot, plan: Plan) -> Numbers:
     """Who publishes what, and what devices say of themselves."""
-    robot.listen(2.5)  # /diagnostics come once a second
+    robot.listen(TOLD_S)
+    robot.listen(HEARD_S, until=lambda _: all(map(robot.device, DEVICES)), more=True)
     nodes = {topic: robot.publishers_of(topic) for topic in CHANNELS}
     found: Numbers = {topic: ', '.join(names) or 'nobody' for topic, names in nodes.items()}
     found['publishers'] = {topic: len(names) for topic, names in nodes.items()}
