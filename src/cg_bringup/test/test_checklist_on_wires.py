@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
 SETUP = 'stance: inner\nfixture: inner_fixed\n'
 PATIENCE = 200.0  # s
+AGAIN = 3  # times that steps are walked through again where a host lost samples
 
 
 @pytest.fixture
@@ -46,6 +47,19 @@ def kept(folder):
     return record.load(path)
 
 
+def failures_that_stay(folder, failed):
+    """Steps that fail every time; a host that loses samples fails one now and then."""
+    for turn in range(AGAIN):
+        if not failed:
+            break
+        process = started(folder / str(turn), '--go-on', '--steps', *failed)
+        said, _ = process.communicate(timeout=PATIENCE)
+        failed = [step.name for step in kept(folder / str(turn)).steps if step.verdict == 'failed']
+    if failed:
+        skip_if_busy(said)
+    return failed
+
+
 def test_a_sound_robot_passes(robot, tmp_path):
     devices, person = robot
     process = started(tmp_path / 'out', '--go-on')
@@ -58,10 +72,10 @@ def test_a_sound_robot_passes(robot, tmp_path):
     assert report['acting'] == 0
     assert report['state'] != 'operation enabled'
     person.until(lambda: person.stage.startswith(('idle', 'unconfigured')))
-    if found.of('failed'):
-        skip_if_busy(said)
-    assert found.of('passed') == [step.title for step in found.steps], said
-    assert process.returncode == 0
+    failed = [step.name for step in found.steps if step.verdict == 'failed']
+    assert len(found.of('passed')) + len(failed) == len(NAMES), said
+    assert process.returncode == (1 if failed else 0)
+    assert not failures_that_stay(tmp_path / 'again', failed), said
     torque = next(step for step in found.steps if step.name == 'torque').measured
     ratio = torque['expected_inverse_inertia'] / torque['inverse_inertia']
     assert ratio == pytest.approx(1.0, abs=0.3)  # the flexible drive has its rotor on top
