@@ -58,6 +58,7 @@ ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may 
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
+SHORT = 0.5  # damping from which a step is short
 HOPE = 10.0  # times that gain, within which it may still come there
 WHOLE = 'fitting whole records, in rounds until it settles'
 ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
@@ -447,7 +448,7 @@ def _minimise(
     if point is None:
         return _Descent(theta, motions, None, False)
     damping = 1e-3
-    errors = []
+    errors = [_error(point)]
 
     def frozen(theta, point):
         """Unknowns that stay where they are, shape (k,)."""
@@ -471,7 +472,6 @@ def _minimise(
 
     for _ in range(iterations):
         check_time()
-        errors.append(point.sse.sum() / point.count.sum())
         if _out_of_reach(errors, reach):
             return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
@@ -486,6 +486,7 @@ def _minimise(
         if candidate is not None and candidate.cost < point.cost:
             gain = point.cost - candidate.cost
             theta, motions, point = trial_theta, trial_motions, candidate
+            errors.append(_error(point))
             damping = max(damping / 10, 1e-9)
             small = max(drift * candidate.cost, SMALL_GAIN)
             little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
@@ -497,6 +498,9 @@ def _minimise(
         else:
             if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:
                 return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
+            if damping > SHORT:
+                # Before, a step that gains nothing only says that it was too long.
+                errors.append(_error(point))
             damping *= 10
             if damping > 1e8:
                 # No step is short enough: a minimum, or a corner of what bodies can be.
@@ -504,6 +508,10 @@ def _minimise(
                     theta, motions, point.beside(barrier, BARRIER), candidate is not None
                 )
     return _Descent(theta, motions, point.beside(barrier, BARRIER), False)
+
+
+def _error(point: Point) -> float:
+    return float(point.sse.sum() / point.count.sum())
 
 
 def _out_of_reach(errors: Sequence[float], reach: float) -> bool:
