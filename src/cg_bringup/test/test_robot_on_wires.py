@@ -17,7 +17,7 @@ pytest.importorskip('canopen')
 pytest.importorskip('serial')
 
 import wired_robot
-from emulated_robot import blame_the_host, skip_if_busy
+from emulated_robot import skip_if_busy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from wired_robot import FAULTS, connected, held_nodes, options_in
@@ -37,7 +37,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
 AT_MOST = 0.02  # s from a fault to zero torque at the drive
 SPREAD = 0.01  # s: the instant of a fault is known from outside by reports of the emulation
-STARTS = 3  # of a robot that shall balance
+STARTS = 5  # of a robot that shall balance
 HELD_UP = 0.01  # s by which a host may hold the emulation up for deadlines to mean anything
 
 
@@ -55,7 +55,7 @@ def standing():
                 break
             stack.close()
         else:
-            blame_the_host(f'it did not stand: {report}')
+            raise AssertionError(f'it did not stand in {STARTS} starts: {report}')
         yield robot, person, nodes
 
 
@@ -83,7 +83,7 @@ def torqued(robot, person):
     A push asks for one. On a busy host the drive drops it for a moment whenever a command is late.
     """
     robot.ask('push 0.4')
-    report = robot.report()
+    report = {}
 
     def acts():
         nonlocal report
@@ -114,7 +114,8 @@ def test_whatever_happens_the_torque_is_zero_in_time_and_stays_zero(standing, fa
     robot.ask('imu_back')
     robot.ask('can_back')
     person.wait(1.0)
-    assert robot.report()['changes'] == []
+    if changes := robot.report()['changes']:
+        pytest.fail(f'torque by itself: {changes}')  # no `assert`: a late host excuses none of it
 
 
 @pytest.mark.evidence
