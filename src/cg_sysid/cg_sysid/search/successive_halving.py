@@ -1,7 +1,8 @@
 """Successive halving: who is fitted on top of one model, in what order, and how far.
 
     first look (excerpt.py), the light ones before the heavy
-      -> those that look best are fitted to whole records, then all others within reach
+      -> those that look best are fitted to whole records, then all others within reach,
+         each time the light ones first
       -> ever longer fits of those that may still win
 
 Rungs of ever more iterations, after each of which only those go on that may still win, are
@@ -11,6 +12,7 @@ comes to is what the next are measured by: a fit out of reach that gains little 
 off, so that a library of effects costs little more than those of them that matter.
 """
 
+import itertools
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -132,7 +134,7 @@ class SuccessiveHalving:
             settings.HALVING.as_good * beaten,
         )
         reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
-        heavy = [replace(t, reach=reach) for t in others if cost_of(t) >= settings.HALVING.heavy]
+        heavy = [replace(t, reach=reach) for t in others if _is_heavy(t)]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
@@ -144,7 +146,8 @@ class SuccessiveHalving:
             return list(self._fitted(tasks, what).values()), [
                 screening.label for screening in screenings if screening.label not in tried
             ]
-        for limit in (_favoured(_smallest(screenings)), np.inf):
+        favoured = _favoured(_smallest(screenings))
+        for limit, heavy in itertools.product((favoured, np.inf), (False, True)):
             best = _best(found)
             reach = min(
                 _reach(best),
@@ -154,7 +157,8 @@ class SuccessiveHalving:
             )
             fewest = settings.HALVING.fewest if np.isinf(beaten) else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
-                    if screening.label not in tried and _known(screening) <= limit]  # fmt: skip
+                    if screening.label not in tried and _known(screening) <= limit
+                    and _is_heavy(screening.task) == heavy]  # fmt: skip
             tried.update(screening.label for screening in heat)
             found |= self._fitted(
                 [replace(screening.task, reach=reach) for screening in heat], what
@@ -273,9 +277,12 @@ def _on_top(base: Task, effects: Effects) -> list[Task]:
 
 def _light(tasks: Iterable[Task]) -> list[Task]:
     """Those that are looked at before the heavy ones, the longest first."""
-    return _longest_first(
-        t for t in tasks if not eventful(t) and cost_of(t) < settings.HALVING.heavy
-    )
+    return _longest_first(t for t in tasks if not eventful(t) and not _is_heavy(t))
+
+
+def _is_heavy(task: Task) -> bool:
+    """Whether it is fitted when the others are: what they came to shows how far it may go."""
+    return cost_of(task) >= settings.HALVING.heavy
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
