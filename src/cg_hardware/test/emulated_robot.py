@@ -5,39 +5,10 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
-
-import pytest
 
 READY = 60.0  # s in which it is there, compilation included
 PRIORITY = -10  # niceness that the drive's node has as well, where it may be had
-NAP = 0.002  # s, a cycle of the drive
-NAPS = 500
-TOO_LATE = 0.01  # s: a drive waits for 16 ms, less a cycle and what the wires take
-
-
-def wakes_late() -> float:
-    """Longest by which this host wakes a thread too late in a second of drive's cycles, s."""
-    worst = 0.0
-    for _ in range(NAPS):
-        due = time.monotonic() + NAP
-        time.sleep(NAP)
-        worst = max(worst, time.monotonic() - due)
-    return worst
-
-
-def skip_if_busy(why: str) -> None:
-    """A verdict on deadlines means nothing on a host that is measured to keep none."""
-    late = wakes_late()
-    if late > TOO_LATE:
-        pytest.skip(f'the host wakes a thread {1000 * late:.0f} ms late, and {why}')
-
-
-def blame_the_host(why: str) -> None:
-    """What failed again and again is the host's fault where that is measured, else ours."""
-    skip_if_busy(why)
-    pytest.fail(f'{why}, and the host keeps time')
 
 
 class Emulated:

@@ -9,7 +9,7 @@ rclpy = pytest.importorskip('rclpy')
 pytest.importorskip('canopen')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from emulated_robot import Emulated, blame_the_host  # noqa: E402
+from emulated_robot import Emulated  # noqa: E402
 from rclpy.experimental.events_executor import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
@@ -96,7 +96,7 @@ class Bench:
             self.until(lambda: self.node.drive.enabled or not self.node.drive.wanted)
             if self.node.drive.enabled:
                 return
-        blame_the_host(f'not enabled in five tries: {self.node.drive.reason}')
+        raise AssertionError(f'not enabled in five tries: {self.node.drive.reason}')
 
     @property
     def zero_state(self):
@@ -139,7 +139,7 @@ def home(bench, service='home'):
         bench.wait(0.1)
         if not any(words in bench.zero_state for words in HELD_UP):
             return
-    blame_the_host(f'{service} failed five times: {bench.zero_state}')
+    raise AssertionError(f'{service} failed five times: {bench.zero_state}')
 
 
 def test_homing_makes_the_hip_zero_at_index_and_offset(make, tmp_path):
@@ -200,7 +200,7 @@ def test_a_robot_that_is_not_at_ease_is_not_homed(make, stage):
         bench.call('disable')
         bench.until(lambda: bench.node._stage == 'idle' and bench.node.procedure is None)
     else:
-        blame_the_host(f'no homing lasted in five tries: {bench.zero_state}')
+        raise AssertionError(f'no homing lasted in five tries: {bench.zero_state}')
     assert said == ['homing is under way: ~/disable ends it'] * 4
     assert f'homing failed: the robot is {stage}' in bench.zero_state
     bench.until(lambda: bench.robot.report()['acting'] == 0)

@@ -147,7 +147,7 @@ class SuccessiveHalving:
                 screening.label for screening in screenings if screening.label not in tried
             ]
         favoured = _favoured(_smallest(screenings))
-        for limit, heavy in itertools.product((favoured, np.inf), (False, True)):
+        for limit, of_heavy in itertools.product((favoured, np.inf), (False, True)):
             best = _best(found)
             reach = min(
                 _reach(best),
@@ -158,7 +158,7 @@ class SuccessiveHalving:
             fewest = settings.HALVING.fewest if np.isinf(beaten) else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
                     if screening.label not in tried and _known(screening) <= limit
-                    and _is_heavy(screening.task) == heavy]  # fmt: skip
+                    and _is_heavy(screening.task) == of_heavy]  # fmt: skip
             tried.update(screening.label for screening in heat)
             found |= self._fitted(
                 [replace(screening.task, reach=reach) for screening in heat], what
