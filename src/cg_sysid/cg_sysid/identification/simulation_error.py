@@ -15,6 +15,7 @@ import numpy as np
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import CompiledModel, Normal, compile_model
+from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.unknowns import Unknown, awake, own_unknowns, unsettled_states
 from cg_sysid.parallel import side_by_side
@@ -31,7 +32,7 @@ class Problem:
     settled at its start (`unsettled_states`, in their spreads), then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
-    place of one.
+    place of one. Models of a search are compiled `shared` with other effects (company.py).
     """
 
     model: Model
@@ -39,6 +40,7 @@ class Problem:
     unknowns: tuple[Unknown, ...]
     guesses: Sequence[np.ndarray]
     refinement: float = 1.0
+    shared: bool = False
     spreads: list[np.ndarray] = field(default_factory=list)
     own: tuple[Unknown, ...] = ()
     blocks: tuple['Block', ...] = ()
@@ -56,8 +58,9 @@ class Problem:
         self.own = own_unknowns(self.model)
         unsettled = unsettled_states(self.model)
         own = [u.name for u in self.own]
-        default = compile_free(self.model, names)
-        model = awake(self.model)
+        acting, resting = in_company(self.model) if self.shared else (self.model, self.model)
+        default = compile_free(acting, names)
+        model = awake(acting)
         for data_set in self.data_sets:
             compiled = compile_model(model, data_set.setup, default)
             m2 = 2 * compiled.equations.coordinates
@@ -76,7 +79,7 @@ class Problem:
             self.own_places.append(np.array([compiled.parameter_names.index(n) for n in own], int))
             self.compiled.append(compiled)
             self.inputs.append(data_set.inputs_for(compiled.input_names))
-            self.vectors.append(parameter_vector(self.model, data_set.setup))
+            self.vectors.append(parameter_vector(resting, data_set.setup))
             self.places.append(np.array([compiled.parameter_names.index(n) for n in names], int))
             self.columns.append(
                 np.array([m2 + order.index(f) if f in order else -1 for f in compiled.free], int)

@@ -211,12 +211,15 @@ def try_candidate(
         unseen = _unseen_shapes(best)
         held_score = score(
             best.model, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
-            task.thorough, task.reach,
+            task.thorough, task.reach, not task.thorough,
         )  # fmt: skip
         events = best.own_by_name(train) | held_score.own_by_name(held)
         model = with_priors_of(best.model, task.model, label)
         residuals = tuple(
-            (predict(found.model, data_set, motion, best.refinement) - data_set.outputs)
+            (
+                predict(found.model, data_set, motion, best.refinement, not task.thorough)
+                - data_set.outputs
+            )
             / data_set.sigma
             for found, data_sets in ((best, train), (held_score, held))
             for data_set, motion in zip(data_sets, found.motions, strict=True)
@@ -398,7 +401,7 @@ def _whole(
     start = excerpt.to_all(start, train) if start else None
     return fit(
         model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
-        thorough=task.thorough, reach=task.reach,
+        thorough=task.thorough, reach=task.reach, shared=not task.thorough,
     )  # fmt: skip
 
 
@@ -499,7 +502,7 @@ def _screened(
         model, few, only,
         horizon=task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0],
         iterations=iterations, start=start, at=at,
-        own=task.events, bounds=task.bounds, reach=task.reach, sure=False,
+        own=task.events, bounds=task.bounds, reach=task.reach, sure=False, shared=True,
     )  # fmt: skip
 
 

@@ -1,0 +1,81 @@
+"""Effects in company: one compiled model for all that act at one place.
+
+To compile a model takes longer than a first look with it, and a search looks at dozens of effects
+on top of one base. So the last effect of a model is compiled beside the others of its place, which
+are at rest: there their laws vanish, and the simulation is the same. For the next of them the
+model is there at once. It takes up to half as long again to run, so this is for searches, not for
+the last fit of what was found.
+"""
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import Effect
+from cg_dynamics.model import Model
+from cg_dynamics.rollout.compiled import REFERENCE_STEP
+
+# Places whose effects go together: the equations of each change alike.
+PLACES = ('sensor',), ('command', 'transmission', 'joint'), ('environment', 'body')
+
+
+def in_company(model: Model) -> tuple[Model, Model]:
+    """A model beside the effects that keep its last one company.
+
+    Args:
+        model: A mechanism in the plane; a robot of a URDF has too many joints and is left alone.
+
+    Returns:
+        The model to compile, in which all of them act, and the same with the others at rest.
+    """
+    alone = model, model
+    if not model.effects or model.mechanism.dimensions != 2:
+        return alone
+    *base, last = model.effects
+    if not _goes_along(last):
+        return alone
+    (places,) = (places for places in PLACES if last.place in places)
+    present = {effect.label for effect in base}
+    acting = resting = model.without_effect(last.label)
+    own = {p.name: model.values[f'{last.label}.{p.name}'] for p in last.parameters}
+    for effect in _library_of(model, places):
+        if effect.label == last.label:
+            # Where the candidate itself is at rest it takes part all the same.
+            acting = acting.with_effect(effect.name, effect.at, **_a_little(effect))
+            resting = resting.with_effect(effect.name, effect.at, **own)
+        elif effect.label not in present:
+            acting = acting.with_effect(effect.name, effect.at, **_a_little(effect))
+            resting = resting.with_effect(effect.name, effect.at, **{_size(effect).name: 0.0})
+    return acting, resting
+
+
+def _library_of(model: Model, places: tuple[str, ...]) -> list[Effect]:
+    """Effects at these places of a mechanism that go along with others."""
+    found = [
+        kind(model.mechanism, at)
+        for kind in LIBRARY.values()
+        if kind.place in places
+        for at in kind.sites(model.mechanism)
+    ]
+    return [effect for effect in found if _goes_along(effect)]
+
+
+def _goes_along(effect: Effect) -> bool:
+    """Whether it can be at rest without a trace: no states, inputs, waits or steps of its own."""
+    return (
+        effect.name in LIBRARY
+        and any(effect.place in places for places in PLACES)
+        and not effect.states
+        and not effect.extra_inputs
+        and effect.largest_step >= REFERENCE_STEP
+        and _size(effect).neutral == 0.0
+        # Steps of no height, and waves that are sought by their frequency.
+        and not any(p.each or p.swept for p in effect.parameters)
+    )
+
+
+def _size(effect: Effect):
+    """The parameter without which the effect is none."""
+    return effect.parameters[0]
+
+
+def _a_little(effect: Effect) -> dict[str, float]:
+    size = _size(effect)
+    return {size.name: size.starts[0] if size.starts else size.scale}
