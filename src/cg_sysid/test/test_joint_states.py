@@ -98,6 +98,29 @@ def test_an_applied_torque_goes_before_the_effort(swing, tmp_path):
     assert np.all(to_record(raw).inputs['shoulder_effort'] == 0.25)
 
 
+def test_currents_become_torques_by_the_gain_in_the_note(swing, tmp_path):
+    amperes = fields_of(swing)['effort'] / -11.1
+    note = {**NOTE, 'effort_gain': {'shoulder': -11.1}}
+    back = read_bag(write(tmp_path / 'bag', swing, note=note, effort=amperes), mechanism=ARM)
+    np.testing.assert_allclose(
+        back.inputs['shoulder_effort'], swing.inputs['shoulder_effort'], rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ('gains', 'message'),
+    [
+        ({'elbow': 2.0}, "effort_gain of 'elbow'; joints with a drive: shoulder$"),
+        ({'shoulder': 0.0}, "effort_gain of 'shoulder' is 0; any other number is allowed"),
+        ({'shoulder': 'strong'}, 'effort_gain.shoulder.*a finite number is needed'),
+    ],
+)
+def test_a_gain_that_makes_no_torque_is_refused(swing, tmp_path, gains, message):
+    bag = write(tmp_path / 'bag', swing, note={**NOTE, 'effort_gain': gains})
+    with pytest.raises(RecordingError, match=message):
+        read_bag(bag, mechanism=ARM)
+
+
 def test_an_effort_that_comes_now_and_then_is_held(swing, tmp_path):
     effort = [row if k % 5 == 0 else [] for k, row in enumerate(fields_of(swing)['effort'])]
     back = read_bag(write(tmp_path / 'bag', swing, effort=effort), mechanism=ARM)

@@ -114,6 +114,7 @@ def _read_open(
     recorded = {c.topic for c in reader.connections}
     has_torque = recorded & {mechanism.torque.name, mechanism.command.name}
     topics = mechanism.topics if has_torque else mechanism.topics_with_effort
+    gains = {} if has_torque else _effort_gains(path, merged_note, mechanism)
     used = [c for c in reader.connections if c.topic in topics]
     for connection in used:
         expected = topics[connection.topic].msgtype
@@ -132,6 +133,7 @@ def _read_open(
         except ValueError as error:
             msg = f'{path}: topic {connection.topic}, sample {len(rows)}: {error}'
             raise RecordingError(msg) from None
+        values |= {name: gains[name] * value for name, value in values.items() if name in gains}
         stamp = message.header.stamp
         rows.append((stamp.sec * NS_PER_S + stamp.nanosec, log_ns, values))
     others = {
@@ -213,6 +215,22 @@ def load_note(path: str | Path) -> dict[str, Any]:
 def _checked_note(text: str, where: str, schema: Form) -> dict[str, Any]:
     note = parse_yaml(text, where, RecordingError)
     return schema.of(note, where, RecordingError)
+
+
+def _effort_gains(
+    path: Path, note: Mapping[str, Any], mechanism: channels.Mechanism
+) -> dict[str, float]:
+    """Channel -> what makes a torque of a recorded effort, such as of a motor's current."""
+    gains = note.get('effort_gain') or {}
+    driven = {c.joint: c.name for c in mechanism.torque.channels}
+    for joint, gain in gains.items():
+        if joint not in driven:
+            msg = f'{path}: note: effort_gain of {joint!r}; joints with a drive: '
+            raise RecordingError(msg + ', '.join(driven))
+        if gain == 0:
+            msg = f'{path}: note: effort_gain of {joint!r} is 0; any other number is allowed'
+            raise RecordingError(msg)
+    return {driven[joint]: gain for joint, gain in gains.items()}
 
 
 def _mechanism_of(

@@ -48,6 +48,7 @@ NOTE = Mapping({
     'software': Key(Text(), default=''),
     'recording': Key(Text(), default=''),
     'effort': Key(Text(('measured', 'commanded')), default='measured'),
+    'effort_gain': Key(MapOf(Number()), default={}),
     'closed_loop': Key(Flag(), default=False),
     'notes': Key(Text(), default=''),
     'checklist': Key(CHECKLIST, default={}),
