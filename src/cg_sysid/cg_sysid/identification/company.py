@@ -3,8 +3,8 @@
 To compile a model takes longer than a first look with it, and a search looks at dozens of effects
 on top of one base. So the last effect of a model is compiled beside the others of its place, which
 are at rest: there their laws vanish, and the simulation is the same. For the next of them the
-model is there at once. It takes up to half as long again to run, so this is for searches, not for
-the last fit of what was found.
+model is there at once. It takes up to twice as long to run: that pays for looks at a few seconds,
+not for fits to whole records.
 """
 
 from cg_dynamics.effects import LIBRARY
@@ -13,7 +13,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import REFERENCE_STEP
 
 # Places whose effects go together: the equations of each change alike.
-PLACES = ('sensor',), ('command', 'transmission', 'joint'), ('environment', 'body')
+PLACES = ('sensor',), ('timing',), ('command', 'transmission', 'joint'), ('environment', 'body')
 
 
 def in_company(model: Model) -> tuple[Model, Model]:

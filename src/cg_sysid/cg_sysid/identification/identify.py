@@ -24,7 +24,6 @@ from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
 from cg_sysid.identification import kept_fits, torque_error
-from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
@@ -283,7 +282,7 @@ def fit(
             that are to be as good as their intervals say.
         reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
         sure: Whether to work out how sure the values are, a tenth of the time of a short fit.
-        shared: Whether a compiled model will do that other candidates share (company.py).
+        shared: With the compiled model of other candidates: for first looks (company.py).
         progress: Called with (what, done, total, how good it is so far in words).
 
     Raises:
@@ -684,11 +683,7 @@ def identify(model: Model, records: Sequence[Record], **how: Any) -> Fit:
 
 
 def predict(
-    model: Model,
-    data_set: DataSet,
-    motion: np.ndarray,
-    refinement: float = 1.0,
-    shared: bool = False,
+    model: Model, data_set: DataSet, motion: np.ndarray, refinement: float = 1.0
 ) -> np.ndarray:
     """Outputs that a model simulates along a data set, shape (n, ny).
 
@@ -697,12 +692,10 @@ def predict(
         data_set: The data set.
         motion: What the data set has of its own (Fit.motions).
         refinement: As the fit's.
-        shared: As the fit's.
     """
     model, motion = in_data_set(model, motion)
-    acting, resting = in_company(model) if shared else (model, model)
-    compiled = compile_model(acting, data_set.setup)
-    p = parameter_vector(resting, data_set.setup)
+    compiled = compile_model(model, data_set.setup)
+    p = parameter_vector(model, data_set.setup)
     u = data_set.inputs_for(compiled.input_names)
     x0 = compiled.initial_state(motion, u[0], p)
     return compiled.readings(data_set.time, u, x0, p, refinement)
@@ -716,7 +709,6 @@ def score(
     bounds: Mapping[str, float] | None = None,
     thorough: bool = False,
     reach: float = np.inf,
-    shared: bool = False,
 ) -> Fit:
     """How well a model simulates data sets that it was not fitted to.
 
@@ -725,6 +717,5 @@ def score(
     `unseen` of which the others could tell nothing, as the shape of a push that none of them had.
     """
     return fit(
-        model, data_sets, only=unseen, own=own, bounds=bounds, thorough=thorough, reach=reach,
-        shared=shared,
-    )  # fmt: skip
+        model, data_sets, only=unseen, own=own, bounds=bounds, thorough=thorough, reach=reach
+    )

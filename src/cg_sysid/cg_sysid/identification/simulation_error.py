@@ -32,7 +32,7 @@ class Problem:
     settled at its start (`unsettled_states`, in their spreads), then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
-    place of one. Models of a search are compiled `shared` with other effects (company.py).
+    place of one. Models of first looks are `shared` with other effects (company.py).
     """
 
     model: Model

@@ -211,15 +211,12 @@ def try_candidate(
         unseen = _unseen_shapes(best)
         held_score = score(
             best.model, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
-            task.thorough, task.reach, not task.thorough,
+            task.thorough, task.reach,
         )  # fmt: skip
         events = best.own_by_name(train) | held_score.own_by_name(held)
         model = with_priors_of(best.model, task.model, label)
         residuals = tuple(
-            (
-                predict(found.model, data_set, motion, best.refinement, not task.thorough)
-                - data_set.outputs
-            )
+            (predict(found.model, data_set, motion, best.refinement) - data_set.outputs)
             / data_set.sigma
             for found, data_sets in ((best, train), (held_score, held))
             for data_set, motion in zip(data_sets, found.motions, strict=True)
@@ -401,7 +398,7 @@ def _whole(
     start = excerpt.to_all(start, train) if start else None
     return fit(
         model, train, start=start, own=task.events, bounds=task.bounds, iterations=iterations,
-        thorough=task.thorough, reach=task.reach, shared=not task.thorough,
+        thorough=task.thorough, reach=task.reach,
     )  # fmt: skip
 
 
