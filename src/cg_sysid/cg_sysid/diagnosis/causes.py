@@ -10,7 +10,7 @@ from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.experiment_design import Proposal, propose
 from cg_sysid.diagnosis.result import Cause
 from cg_sysid.diagnosis.small_faults import shown
-from cg_sysid.diagnosis.thorough import fitted_to_all, tie
+from cg_sysid.diagnosis.ties import fitted_to_all, tie
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification.identify import Fit

@@ -26,7 +26,7 @@ from cg_sysid.diagnosis.forward import extend
 from cg_sysid.diagnosis.landing_cause import with_landings
 from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.diagnosis.small_faults import less_small_faults
-from cg_sysid.diagnosis.thorough import ties_settled
+from cg_sysid.diagnosis.ties import ties_settled
 from cg_sysid.diagnosis.workspace import Progress, Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet, prepare

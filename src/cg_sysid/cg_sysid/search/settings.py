@@ -56,6 +56,7 @@ class Noise:
 
     Attributes:
         at_noise: Of each output, training and held out: up to here it is explained.
+        quick: Of each output after a quick fit: up to here a thorough one may come to the noise.
         settled: Of a fit or a piece of a record: up to here nothing is left to find.
         nothing_left: Of all records: no record can hold an event of its own.
         much_wrong: From here on much is wrong with a model.
@@ -64,6 +65,7 @@ class Noise:
     """
 
     at_noise: float = 1.3
+    quick: float = 3.0
     settled: float = 1.2
     nothing_left: float = 1.03
     much_wrong: float = 1.5
