@@ -155,7 +155,9 @@ class SuccessiveHalving:
                 worth_having(best, base.base),
                 earned,
             )
-            fewest = settings.HALVING.fewest if np.isinf(beaten) else 0
+            # Looks may mislead, but who comes to the noise has rivals only that do so too.
+            undecided = np.isinf(beaten) and best > settings.NOISE.much_wrong
+            fewest = settings.HALVING.fewest if undecided else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
                     if screening.label not in tried and _known(screening) <= limit
                     and _is_heavy(screening.task) == of_heavy]  # fmt: skip
