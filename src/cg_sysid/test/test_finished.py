@@ -8,8 +8,8 @@ import pytest
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.deadline import Deadline
-from cg_sysid.diagnosis.comparing import complete
 from cg_sysid.diagnosis.result import Options
+from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
@@ -50,27 +50,27 @@ def test_near_the_noise_a_thorough_fit_tells(search, monkeypatch):
     work, o = search
     asked = fits_of(work, monkeypatch)
     near = leaving(o, 0.9 * settings.NOISE.quick)
-    assert complete(work, near)
-    assert complete(work, near)
+    assert finished(work, near)
+    assert finished(work, near)
     assert asked() == ['thorough fits of nominal']  # once
 
 
-def test_what_a_thorough_fit_leaves_as_well_is_not_complete(search, monkeypatch):
+def test_what_a_thorough_fit_leaves_as_well_is_not_finished(search, monkeypatch):
     work, o = search
     near = leaving(o, 0.9 * settings.NOISE.quick)
     monkeypatch.setattr(work.halving, 'fit', lambda tasks, what: [])
-    assert not complete(work, near)
+    assert not finished(work, near)
 
 
 def test_far_from_the_noise_none_is_asked_for(search, monkeypatch):
     work, o = search
     asked = fits_of(work, monkeypatch)
-    assert not complete(work, leaving(o, 1.1 * settings.NOISE.quick))
+    assert not finished(work, leaving(o, 1.1 * settings.NOISE.quick))
     assert not asked()
 
 
 def test_at_the_noise_none_is_asked_for(search, monkeypatch):
     work, o = search
     asked = fits_of(work, monkeypatch)
-    assert complete(work, o)
+    assert finished(work, o)
     assert not asked()

@@ -9,7 +9,7 @@ from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
-from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
@@ -70,12 +70,7 @@ def led_deeper(
 
 def done(work: Workspace, o: Outcome) -> bool:
     """Whether there is nothing to look for on top of this."""
-    return complete(work, o) or work.selection.nothing_material(o)
-
-
-def complete(work: Workspace, o: Outcome) -> bool:
-    """Whether this is at the noise, and not by small faults that only imitate it."""
-    return finished(work, o) and not work.selection.imitated(o)
+    return (settled(o) and not work.selection.imitated(o)) or work.selection.nothing_material(o)
 
 
 def alone(work: Workspace, base: Outcome) -> Task:
@@ -90,7 +85,7 @@ def refitted(work: Workspace, o: Outcome) -> Outcome:
     What stands as the base of a round has to be as good as it can be, or the next effect is
     accepted for a better fit of this one. At the noise there is no next round.
     """
-    if finished(work, o):
+    if settled(o) or finished(work, o):
         return o
     task = Task(o.model, events=o.events, bounds=o.task.bounds)
     again = work.halving.fit([task], f'{o.label} again')

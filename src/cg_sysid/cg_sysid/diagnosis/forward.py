@@ -1,7 +1,8 @@
 """Forward selection: one effect after the other, until nothing more is earned."""
 
-from cg_sysid.diagnosis.comparing import compare, complete, done, refitted
+from cg_sysid.diagnosis.comparing import compare, done, refitted
 from cg_sysid.diagnosis.small_faults import bare, of_size, rather_one_cause, with_small_faults
+from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search.candidates import Outcome
 from cg_sysid.search.model_selection import settled
@@ -10,7 +11,7 @@ from cg_sysid.search.model_selection import settled
 def extend(work: Workspace, o: Outcome) -> Outcome:
     """Accept one effect after the other, until nothing more is earned."""
     work.found = o
-    while len(work.added(o)) < work.options.rounds and not complete(work, o):
+    while len(work.added(o)) < work.options.rounds and not finished(work, o):
         plain, o = o, with_small_faults(work, o)
         winner = None
         if not done(work, o):

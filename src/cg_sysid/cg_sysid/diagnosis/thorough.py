@@ -26,10 +26,13 @@ def finished(work: Workspace, o: Outcome) -> bool:
     """Whether nothing is left to explain, if need be in finer steps of integration.
 
     Quick fits of a stiff law, as of friction that turns within 1 mrad/s, may end at twice the
-    noise. Whatever is put on top would be a search for their errors.
+    noise. Whatever is put on top would be a search for their errors. Where small faults take up
+    what is left it is not asked: they may only imitate it.
     """
     near = (per_output(side) < settings.NOISE.quick for side in (o.train, o.held))
-    return settled(o) or (all(map(all, near)) and settled(thorough(work, o)))
+    return not o.task.bounds and (
+        settled(o) or (all(map(all, near)) and settled(thorough(work, o)))
+    )
 
 
 def fitted_thoroughly(work: Workspace, o: Outcome) -> Outcome:
