@@ -61,8 +61,10 @@ def test_the_others_change_nothing(name, effect, at):
     theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
     guesses = [data_set.motion for data_set in data_sets]
     alone, beside = (
-        evaluate(Problem(model, data_sets, unknowns, guesses, shared=shared), theta, guesses, 9, 1)
-        for shared in (False, True)
+        evaluate(
+            Problem(model, data_sets, unknowns, guesses, company=company), theta, guesses, 9, 1
+        )
+        for company in (False, True)
     )
     # The same sums, in another order of rounding; sensitivities lose some digits more.
     assert beside.cost == pytest.approx(alone.cost, rel=1e-9)

@@ -259,7 +259,7 @@ def fit(
     thorough: bool = False,
     reach: float = np.inf,
     sure: bool = True,
-    shared: bool = False,
+    company: bool = False,
     progress: Progress = lambda what, done, total, best: None,
 ) -> Fit:
     """Identify a model's parameters from data sets.
@@ -282,7 +282,7 @@ def fit(
             that are to be as good as their intervals say.
         reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
         sure: Whether to work out how sure the values are, a tenth of the time of a short fit.
-        shared: With the compiled model of other candidates: for first looks (company.py).
+        company: Compiled beside other effects, for first looks (company.py).
         progress: Called with (what, done, total, how good it is so far in words).
 
     Raises:
@@ -294,7 +294,7 @@ def fit(
     unknowns = unknowns_of(model, only, bounds)
     refinement = REFINED if thorough else 1.0
     problem = Problem(
-        model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement, shared
+        model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement, company
     )
     by_torque = start is None and torque_error.can(model)
     if by_torque and at is None:

@@ -32,7 +32,7 @@ class Problem:
     settled at its start (`unsettled_states`, in their spreads), then the values of
     `own_unknowns`; `blocks` say what is eliminated together. It is believed to lie at
     `guesses`, give or take `spreads` (`spread`). `refinement` integration steps are taken in
-    place of one. Models of first looks are `shared` with other effects (company.py).
+    place of one. Models of first looks are compiled in `company` of other effects.
     """
 
     model: Model
@@ -40,7 +40,7 @@ class Problem:
     unknowns: tuple[Unknown, ...]
     guesses: Sequence[np.ndarray]
     refinement: float = 1.0
-    shared: bool = False
+    company: bool = False
     spreads: list[np.ndarray] = field(default_factory=list)
     own: tuple[Unknown, ...] = ()
     blocks: tuple['Block', ...] = ()
@@ -58,7 +58,7 @@ class Problem:
         self.own = own_unknowns(self.model)
         unsettled = unsettled_states(self.model)
         own = [u.name for u in self.own]
-        acting, resting = in_company(self.model) if self.shared else (self.model, self.model)
+        acting, resting = in_company(self.model) if self.company else (self.model, self.model)
         default = compile_free(acting, names)
         model = awake(acting)
         for data_set in self.data_sets:

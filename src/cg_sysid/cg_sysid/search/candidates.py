@@ -499,7 +499,7 @@ def _screened(
         model, few, only,
         horizon=task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0],
         iterations=iterations, start=start, at=at,
-        own=task.events, bounds=task.bounds, reach=task.reach, sure=False, shared=True,
+        own=task.events, bounds=task.bounds, reach=task.reach, sure=False, company=True,
     )  # fmt: skip
 
 
