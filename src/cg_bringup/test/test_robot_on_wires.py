@@ -58,9 +58,8 @@ def standing():
         yield robot, person, nodes
 
 
-def seen(robot):
-    """How the robot is, from a host that keeps time."""
-    report = robot.report()
+def believed(report):
+    """A report of deadlines, from an emulation that kept its own."""
     if report['late'] > HELD_UP:
         pytest.skip(f'the host held the emulation up by {report["late"]:.3f} s')
     return report
@@ -70,7 +69,7 @@ def test_it_stands_is_pushed_and_stands(standing):
     robot, person, _ = standing
     robot.ask('push 0.5')
     person.wait(3.0)
-    report = seen(robot)
+    report = believed(robot.report())
     assert abs(report['lean']) < 0.02
     assert report['farthest'] < 0.2
     assert person.stage == 'active'
@@ -104,9 +103,11 @@ def test_whatever_happens_the_torque_is_zero_in_time_and_stays_zero(standing, fa
     before = torqued(robot, person)
     FAULTS[fault](robot, nodes)
     person.wait(0.3)
-    report = seen(robot)
-    at, torque = report['changes'][-1]
-    assert (report['acting'], torque) == (0, 0)
+    report = robot.report()
+    if report['acting']:
+        pytest.fail(f'torque acts on: {report}')  # no `assert`: no host is late by so much
+    at, torque = believed(report)['changes'][-1]
+    assert torque == 0
     assert at - before['time'] < AT_MOST + SPREAD
     if fault == 'balance_stopped':
         os.kill(nodes['balance'].pid, signal.SIGCONT)

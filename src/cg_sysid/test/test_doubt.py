@@ -2,17 +2,11 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_dynamics.rig import Setup
-from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.doubt import exchange
-from cg_sysid.diagnosis.result import Options
-from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification.data_set import prepare
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, try_candidate
 from cg_sysid.search.model_selection import Comparison
@@ -25,15 +19,9 @@ def search(model_file):
     """A workspace, the nominal outcome, and those of two effects on top of it."""
     nominal = Model.load(model_file)
     machine = nominal.with_effect(OWN, bias=0.8)
-    records = [
-        rehearse(f'r{k}', machine, Setup(fixture='inner_fixed'), [0.1, 0.0],
-                 [lambda t, k=k: 3 * np.sin((3 + k) * t)], 2.0, 0.004, k)
-        for k in range(2)
-    ]  # fmt: skip
-    train, held = ([data_set] for data_set in prepare(nominal, records))
-    work = Workspace(nominal, train, held, Options(workers=1), lambda *_: None, None, Deadline())
+    work = search_for(nominal, machine)
     base, own, rival = (
-        try_candidate(Task(nominal, effect, iterations=8), train, held)
+        try_candidate(Task(nominal, effect, iterations=8), work.train, work.held)
         for effect in (None, (OWN, None), (RIVAL, None))
     )
     return work, base, own, rival

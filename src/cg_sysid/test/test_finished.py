@@ -4,15 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_dynamics.rig import Setup
-from cg_sysid.deadline import Deadline
-from cg_sysid.diagnosis.result import Options
 from cg_sysid.diagnosis.thorough import finished
-from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification.data_set import prepare
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, try_candidate
 
@@ -21,14 +16,8 @@ from cg_sysid.search.candidates import Task, try_candidate
 def search(model_file):
     """A workspace and the outcome of a model that lacks nothing."""
     nominal = Model.load(model_file)
-    records = [
-        rehearse(f'r{k}', nominal, Setup(fixture='inner_fixed'), [0.1, 0.0],
-                 [lambda t, k=k: 3 * np.sin((3 + k) * t)], 2.0, 0.004, k)
-        for k in range(2)
-    ]  # fmt: skip
-    train, held = ([data_set] for data_set in prepare(nominal, records))
-    work = Workspace(nominal, train, held, Options(workers=1), lambda *_: None, None, Deadline())
-    return work, try_candidate(Task(nominal, iterations=8), train, held)
+    work = search_for(nominal, nominal)
+    return work, try_candidate(Task(nominal, iterations=8), work.train, work.held)
 
 
 def leaving(o, times):

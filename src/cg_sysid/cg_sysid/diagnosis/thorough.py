@@ -25,9 +25,9 @@ def thorough(work: Workspace, o: Outcome) -> Outcome:
 def finished(work: Workspace, o: Outcome) -> bool:
     """Whether nothing is left to explain, if need be in finer steps of integration.
 
-    Quick fits of a stiff law, as of friction that turns within 1 mrad/s, may end at twice the
-    noise. Whatever is put on top would be a search for their errors. Where small faults take up
-    what is left it is not asked: they may only imitate it.
+    Quick fits of stiff friction may end at twice the noise. Whatever is put on top would be a
+    search for their errors. Where small faults are let go it is not asked, as they may only
+    imitate the noise.
     """
     near = (per_output(side) < settings.NOISE.quick for side in (o.train, o.held))
     return not o.task.bounds and (

@@ -114,7 +114,7 @@ def _read_open(
     recorded = {c.topic for c in reader.connections}
     has_torque = recorded & {mechanism.torque.name, mechanism.command.name}
     topics = mechanism.topics if has_torque else mechanism.topics_with_effort
-    gains = {} if has_torque else _effort_gains(path, merged_note, mechanism)
+    gains = _effort_gains(path, merged_note, mechanism)
     used = [c for c in reader.connections if c.topic in topics]
     for connection in used:
         expected = topics[connection.topic].msgtype
@@ -133,7 +133,8 @@ def _read_open(
         except ValueError as error:
             msg = f'{path}: topic {connection.topic}, sample {len(rows)}: {error}'
             raise RecordingError(msg) from None
-        values |= {name: gains[name] * value for name, value in values.items() if name in gains}
+        if connection.topic == JOINT_STATES:
+            values = {name: gains.get(name, 1.0) * value for name, value in values.items()}
         stamp = message.header.stamp
         rows.append((stamp.sec * NS_PER_S + stamp.nanosec, log_ns, values))
     others = {

@@ -155,7 +155,7 @@ class SuccessiveHalving:
                 worth_having(best, base.base),
                 earned,
             )
-            # Looks may mislead, but who comes to the noise has rivals only that do so too.
+            # Looks may mislead. But once one fit is at the noise, only others there can rival it.
             undecided = np.isinf(beaten) and best > settings.NOISE.much_wrong
             fewest = settings.HALVING.fewest if undecided else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
@@ -283,7 +283,7 @@ def _light(tasks: Iterable[Task]) -> list[Task]:
 
 
 def _is_heavy(task: Task) -> bool:
-    """Whether it is fitted when the others are: what they came to shows how far it may go."""
+    """Whether it waits for the light ones: what those come to shows how far it may go."""
     return cost_of(task) >= settings.HALVING.heavy
 
 
