@@ -107,6 +107,15 @@ def test_currents_become_torques_by_the_gain_in_the_note(swing, tmp_path):
     )
 
 
+def test_a_gain_is_of_efforts_on_joint_states_alone(swing, tmp_path):
+    note = {**NOTE, 'effort_gain': {'shoulder': -11.1}}
+    back = read_bag(write(tmp_path / 'bag', swing, note=note, torque=0.25), mechanism=ARM)
+    assert np.all(back.inputs['shoulder_effort'] == 0.25)
+    # Written once more it is a torque, and stays one.
+    again = read_bag(write_bag(tmp_path / 'again', back), mechanism=ARM)
+    assert np.all(again.inputs['shoulder_effort'] == 0.25)
+
+
 @pytest.mark.parametrize(
     ('gains', 'message'),
     [
