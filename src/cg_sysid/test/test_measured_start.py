@@ -12,8 +12,9 @@ from cg_sysid.diagnosis.diagnose import diagnose, led_in
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import score
-from cg_sysid.identification.measured_start import judged
+from cg_sysid.identification.measured_start import MeasuredStart, judged
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 
@@ -66,7 +67,7 @@ def test_a_cause_that_only_fitted_starts_like_is_doubted(nominal):
     fitted = score(nominal, data_sets)
     found = judged(nominal.mechanism, data_sets, fitted, replace(fitted))
     assert not found.helps
-    assert 'That is no gain' in found.text
+    assert 'no error changes. That is no gain' in found.text
     # A start that is known to a tenth of a rad judges nothing.
     vague = [replace(t, motion_noise=0.01 * np.eye(len(t.motion))) for t in data_sets]
     assert judged(nominal.mechanism, vague, fitted, fitted) is None
@@ -86,3 +87,18 @@ def test_a_model_whose_encoder_is_off_starts_where_it_reads_what_was_measured(no
     # would be of that order.
     assert hip.after < 3 * hip.noise
     assert hip.before > 20 * hip.noise
+
+
+def test_what_changes_is_told_in_one_unit_and_what_does_not_is_not_listed():
+    gains = (
+        Gain('imu_angle', 'rad', 0.000489, 0.000488, 0.0005),
+        Gain('hip_angle', 'rad', 0.0064, 0.000106, 0.0001),
+    )
+    assert MeasuredStart(gains, {'a': 5.0}, True).text == (
+        'over all of the held-out records, started from the measured angles, the error of '
+        'hip_angle falls from 6.40 to 0.106 mrad; other outputs stay as they are'
+    )
+    assert MeasuredStart(gains[1:], {'a': 0.8, 'b': 2.0}, False).text == (
+        'over the first 0.8 to 2 s of held-out records, started from the measured angles, the '
+        'error of hip_angle falls from 6.40 to 0.106 mrad'
+    )

@@ -19,7 +19,7 @@ from cg_dynamics.mechanisms.mechanism import Mechanism
 from cg_sysid.identification.data_set import DataSet, sensor_matrix
 from cg_sysid.identification.gain import NO_GAIN, Gain
 from cg_sysid.identification.identify import Fit, predict, score
-from cg_sysid.text import listed
+from cg_sysid.text import listed, number, scaled
 
 OWN_PART = 0.5  # of the nominal model's error, that the noise of the start may make
 SHORTEST = 0.05  # of a record; if the start carries no further, it judges nothing
@@ -53,19 +53,30 @@ class MeasuredStart:
     @property
     def text(self) -> str:
         """One sentence for people."""
-        far = 'to their ends'
+        far = 'all of the held-out records'
         if not self.whole:
-            far = f'for {min(self.carried.values()):.2g} to {max(self.carried.values()):.2g} s'
-        told = listed(
-            [f'{g.channel} from {g.before:.3g} to {g.after:.3g} {g.unit}' for g in self.gains]
-        )
-        head = f'from the measured angles, which carry the held-out records {far}, the error goes'
+            least, most = min(self.carried.values()), max(self.carried.values())
+            far = f'the first {least:.2g} to {most:.2g} s of held-out records'
+        moved = [g for g in self.gains if not 1 / NO_GAIN < g.before / g.after < NO_GAIN]
+        told = 'no error changes'
+        if moved:
+            told = f'the error of {listed([_change(g) for g in moved])}'
+            if len(moved) < len(self.gains):
+                told += '; other outputs stay as they are'
+        text = f'over {far}, started from the measured angles, {told}'
         if self.helps:
-            return f'{head}: {told}'
+            return text
         return (
-            f'{head}: {told}. That is no gain, where fitted starts show one: what is named may '
+            f'{text}. That is no gain, where fitted starts show one: what is named may '
             'stand in for something that the starts take up'
         )
+
+
+def _change(gain: Gain) -> str:
+    factor, unit = scaled(max(gain.before, gain.after), gain.unit)
+    before, after = (number(factor * error) for error in (gain.before, gain.after))
+    verb = 'falls' if gain.after < gain.before else 'grows'
+    return f'{gain.channel} {verb} from {before} to {after} {unit}'
 
 
 def judged(
