@@ -305,6 +305,17 @@ def test_each_fault_is_found_in_its_place(fault, seed):
         assert found[0].start_s == pytest.approx(place, abs=0.06)
 
 
+@pytest.mark.parametrize('held', [20, 80, 400])
+@pytest.mark.parametrize('last', [400, 2500, SAMPLES - 10])
+def test_messages_that_waited_for_the_recorder_say_nothing_about_clocks(held, last):
+    raw = synthesise(Synthesis(jitter=0.5), SEEDS[0])
+    for topic in ('/imu', '/applied_torque'):
+        log = raw.topics[topic].log_ns.copy()
+        log[last - held : last] = log[last] - 13_000 * np.arange(held, 0, -1)
+        raw = edit(raw, topic, log_ns=log)
+    assert check_recording(raw).verdict == 'good'
+
+
 def test_a_switch_is_stamped_when_it_changes():
     rows = [0, SAMPLES - 1]
     raw = synthesise(Synthesis(), SEEDS[0])

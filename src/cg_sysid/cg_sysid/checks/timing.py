@@ -22,6 +22,7 @@ RATE_BLOCK = 25  # samples per block when looking for a change of rate
 CLOCK_JUMP_S = 0.02  # step between stamp and recorder's clock, in s
 LATE_S = 0.5  # a topic that starts later or ends earlier than the others by this, in s
 REGULAR = 0.3  # see bags.REGULAR_AFTER_SORTING
+WAITED = 0.1  # of the spacing of two stamps: arrivals closer than this came out of a queue, [1]
 
 
 def check_timing(raw: RawRecording) -> Iterator[Finding]:
@@ -162,9 +163,13 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     In lock-step simulation the two clocks run at different speeds and say nothing about each
     other.
     """
-    if not independent_arrivals(topic) or len(topic) < 4 * FLOOR:
+    if not independent_arrivals(topic):
         return
-    stamp, log = topic.stamp_ns, topic.log_ns
+    # Messages that have waited for the recorder arrive with the next one: nobody paced them.
+    paced = np.flatnonzero(np.diff(topic.log_ns) > WAITED * np.diff(topic.stamp_ns))
+    if len(paced) < 4 * FLOOR:
+        return
+    stamp, log = topic.stamp_ns[paced], topic.log_ns[paced]
     change = _change_of_rate(np.diff(log) / NS_PER_S)
     if change is not None and _change_of_rate(np.diff(stamp) / NS_PER_S) is None:
         k, before, after = change
@@ -176,7 +181,7 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
             'as before: they are wrong',
             _seconds(stamp[k], origin),
             _seconds(stamp[-1], origin),
-            k,
+            int(paced[k]),
             after,
             before,
         )
@@ -196,8 +201,8 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
             topic.name,
             f'about {lost} sample(s) lost, the first '
             'here, while the stamps go on as if none were: they are wrong',
-            _seconds(stamp[k - 1], origin),
-            _seconds(stamp[holes[-1]], origin),
+            _seconds(topic.stamp_ns[k - 1], origin),
+            _seconds(topic.stamp_ns[holes[-1]], origin),
             k,
             lost,
             0,
@@ -217,7 +222,7 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     k = near.start + int(np.argmax(jumps[near])) + 1
     in_log = abs(log[k] - log[k - 1] - np.median(np.diff(log)))
     in_stamp = abs(stamp[k] - stamp[k - 1] - np.median(np.diff(stamp)))
-    place = (_seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), k)
+    place = (_seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), int(paced[k]))
     size = f'{1e3 * abs(lasting):.0f} ms'
     if in_stamp > in_log:
         yield Finding(
