@@ -29,6 +29,7 @@ from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, try_candidate
 from cg_sysid.search.model_selection import Comparison, ModelSelection, share_explained
 
+SKETCHES = 'learned terms on pieces of the records'
 FINALISTS = 4
 WORTH_FITTING = 8.0  # times the best sketch's error above the noise
 WORTH_SKETCHING = 0.97  # share of the error of other records that a sketch may leave
@@ -58,16 +59,24 @@ def characterise(
         run: Calls a function with each tuple of arguments, in parallel perhaps, and tells people
             what for.
     """
+    (sketched,) = run(sketch, [(_lasting(base), train, held)], SKETCHES)
+    return _from_sketch(base, sketched, (train, held), run)
+
+
+def _from_sketch(
+    base: Outcome, sketched: tuple[float, Sequence[Term]], sides: Sides, run: Run
+) -> Unmodelled | None:
+    """The best of the terms that are worth a fit; None if none is significant."""
     lasting = _lasting(base)
-    length, terms = sketch(lasting, train, held)
+    length, terms = sketched
     if not terms:
         return None
     shared = [term for term in terms if term.effect.kind != 'vibrating'][:FINALISTS]
     found = None
     if not shared or terms[0].error < OWN_PHASES * shared[0].error:
-        found = _vibrating(base, terms[0], (train, held), run)
+        found = _vibrating(base, terms[0], sides, run)
     if found is None and shared:
-        found = _smooth_or_periodic(base, lasting, shared, WINDOW * length, (train, held), run)
+        found = _smooth_or_periodic(base, lasting, shared, WINDOW * length, sides, run)
     return found
 
 
@@ -93,8 +102,10 @@ def what_remains(
         held: Data sets that judge.
         run: As in `characterise`.
     """
-    beside = characterise(final, train, held, run)
-    alone = characterise(nominal, train, held, run) if causes else None
+    bases = [final, nominal] if causes else [final]
+    sketches = run(sketch, [(_lasting(base), train, held) for base in bases], SKETCHES)
+    beside = _from_sketch(final, sketches[0], (train, held), run)
+    alone = _from_sketch(nominal, sketches[1], (train, held), run) if causes else None
     if (
         alone is None
         or _of_one_family(nominal, final, causes, alone)

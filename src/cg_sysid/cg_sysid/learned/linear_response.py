@@ -68,21 +68,68 @@ class Piece:
         """Samples less those that the initial motion took."""
         return len(self.missed) - self.project.shape[1]
 
-    def by_torque(self, row: np.ndarray, forcing: np.ndarray) -> np.ndarray:
-        """Response to torques on one joint, shape (m, k).
+    def to_torque(self, row: np.ndarray) -> 'Response':
+        """To torques on one joint at the slots.
 
         Args:
             row: Generalised force per torque, shape (n,).
-            forcing: Torques at the slots in N m, shape (slots, k).
         """
-        return np.tensordot(self.torque, row, (1, 0)) @ forcing
+        response = np.tensordot(self.torque, row, (1, 0))
+        return Response(
+            self.parameters.T @ response, self.missed @ response,
+            np.asarray(np.linalg.qr(response, mode='r')), np.zeros((0, response.shape[1])),
+        )  # fmt: skip
 
-    def by_error(self, channel: int, error: np.ndarray) -> np.ndarray:
-        """Response to errors of one sensor at its own samples, shape (m, k)."""
+    def to_error(self, channel: int) -> 'Response':
+        """To errors of one sensor at its own samples."""
         own = self.samples == channel
-        response = np.zeros((len(self.missed), error.shape[1]))
-        response[own] = error / self.sigma[own, None]
-        return response - self.project @ (self.project[own].T @ response[own])
+        weight = 1 / self.sigma[own]
+        return Response(
+            self.parameters[own].T * weight, self.missed[own] * weight, weight,
+            self.project[own].T * weight,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a piece does of something at n instants, A, as inner products with all that is known.
+
+    |A f|^2 = |S f|^2 - |L f|^2, with S of n rows at most, where A has one for every sample.
+
+    Attributes:
+        parameters: J^T A, shape (k, n).
+        missed: r^T A, shape (n,).
+        square: S, shape (rows, n), or its diagonal, shape (n,).
+        start: L, what an initial motion takes of it, shape (2m0, n).
+    """
+
+    parameters: np.ndarray
+    missed: np.ndarray
+    square: np.ndarray
+    start: np.ndarray
+
+    def times(self, carrier: np.ndarray) -> 'Response':
+        """To what is multiplied by a signal first, shape (n,)."""
+        return Response(
+            self.parameters * carrier, self.missed * carrier, self.square * carrier,
+            self.start * carrier,
+        )  # fmt: skip
+
+    def squared(self, basis: np.ndarray) -> np.ndarray:
+        """S of functions given at the instants: shape (..., n, functions) -> (..., rows, ...)."""
+        return self.square @ basis if self.square.ndim == 2 else self.square[:, None] * basis
+
+    def with_constant(self) -> np.ndarray:
+        """Inner products of what a constant does with what each instant does, shape (n,)."""
+        one = np.ones((len(self.missed), 1))
+        own, taken = self.squared(one)[:, 0], (self.start @ one)[:, 0]
+        mine = self.square.T @ own if self.square.ndim == 2 else self.square * own
+        return mine - self.start.T @ taken
+
+    def among(self, basis: np.ndarray) -> np.ndarray:
+        """Inner products of the responses to functions, shape (functions, functions)."""
+        own, taken = self.squared(basis), self.start @ basis
+        return own.T @ own - taken.T @ taken
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from cg_dynamics.effects.unmodelled import COSINES, JointTerm, LearnedEffect, Se
 from cg_dynamics.model import Model
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.information_criterion import weight_of
-from cg_sysid.learned.linear_response import SAMPLES_HZ, Piece, Pieces
+from cg_sysid.learned.linear_response import SAMPLES_HZ, Piece, Pieces, Response
 
 BEYOND = 0.05  # share of the range of data by which a smooth function goes beyond them
 ROUGHNESS = (1.5, 3.0, 6.0, 12.0, 24.0, 48.0)  # half waves beyond which coefficients fade
@@ -96,15 +96,23 @@ class Sketches:
              for u, v in zip(unknowns, values, strict=True)]
         )  # fmt: skip
         self.swept: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+        self.responses: dict[tuple, list[Response]] = {}
+        k = len(unknowns)
         self.squares, self.samples = {False: 0.0, True: 0.0}, {False: 0, True: 0}
+        self.alone: tuple[Fold, Fold] = (
+            {held: np.zeros((1, k, k)) for held in (False, True)},
+            {held: np.zeros((1, k)) for held in (False, True)},
+        )
         for p in self.pieces:
             self.squares[p.held] += float(p.missed @ p.missed)
             self.samples[p.held] += p.degrees
+            self.alone[0][p.held] += p.parameters.T @ p.parameters
+            self.alone[1][p.held] += p.parameters.T @ p.missed
 
     @functools.cached_property
     def nothing(self) -> float:
         """What is left with no term, parameters adjusted: chi2 per sample of other records."""
-        return float(self._errors(self._sums(self._no_columns()), NONE[None, :])[0])
+        return float(self._errors(self.alone, NONE[None, :])[0])
 
     def all(self) -> list[Term]:
         """Every term that these records could show, best first."""
@@ -144,16 +152,29 @@ class Sketches:
         channel = self.body.outputs.index(effect.site.partition(':')[0])
         return piece.at_samples[effect.follows][piece.samples == channel]
 
-    def _columns(self, effect: LearnedEffect, piece: Piece, basis: np.ndarray) -> np.ndarray:
-        """Response of a piece to each function of a basis, given at its slots or samples."""
+    def _responses(self, effect: LearnedEffect) -> list[Response]:
+        """What each piece does of the term where it is one, by what it follows."""
         place = effect.site.partition(':')[0]
-        if isinstance(effect, SensorTerm):
-            return piece.by_error(self.body.outputs.index(place), basis)
-        if isinstance(effect, JointTerm):
-            row = np.array(self.body.joints[place])
-            return piece.by_torque(row, self._carrier(effect, piece)[:, None] * basis)
-        leg = self.data_sets[piece.record].setup.stance if place == 'stance' else place
-        return piece.by_torque(np.eye(2)[self.body.bodies.index(leg)], basis)
+        found = self._at(place, isinstance(effect, SensorTerm), isinstance(effect, JointTerm))
+        if not isinstance(effect, JointTerm) or not effect.carrier:
+            return found
+        return [r.times(self._carrier(effect, p)) for r, p in zip(found, self.pieces, strict=True)]
+
+    def _at(self, place: str, sensor: bool, joint: bool) -> list[Response]:
+        """The same of an error of one sensor, or of a torque at one joint or on one leg."""
+        key = place, sensor, joint
+        if key in self.responses:
+            return self.responses[key]
+        found = []
+        for piece in self.pieces:
+            if sensor:
+                found.append(piece.to_error(self.body.outputs.index(place)))
+                continue
+            leg = self.data_sets[piece.record].setup.stance if place == 'stance' else place
+            row = self.body.joints[place] if joint else np.eye(2)[self.body.bodies.index(leg)]
+            found.append(piece.to_torque(np.array(row)))
+        self.responses[key] = found
+        return found
 
     def _carrier(self, effect: JointTerm, piece: Piece) -> np.ndarray:
         joint = effect.site.partition(':')[0]
@@ -173,12 +194,12 @@ class Sketches:
         margin = BEYOND * (high - low)
         low, high = low - margin, high + margin
         waves = np.arange(COSINES)
-        columns = []
+        bases = []
         for piece in self.pieces:
             z = np.clip((self._variable(effect, piece) - low) / (high - low), 0, 1)
-            columns.append(self._columns(effect, piece, np.cos(np.pi * np.outer(z, waves))))
-        tolerances = self._size(columns) / (1 + (waves / np.array(ROUGHNESS)[:, None]) ** 2)
-        sums = self._sums(columns)
+            bases.append(np.cos(np.pi * np.outer(z, waves)))
+        sums = self._sums(effect, bases)
+        tolerances = self._size(sums) / (1 + (waves / np.array(ROUGHNESS)[:, None]) ** 2)
         errors = self._errors(sums, tolerances)
         best = int(np.argmin(errors))
         fixed = {'low': low, 'high': high}
@@ -211,14 +232,14 @@ class Sketches:
         harmonics = np.arange(1, (len(effect.coefficients) + 1) // 2 + 1)[
             : len(effect.coefficients) // 2
         ]
-        columns = []
+        bases = []
         for piece in self.pieces:
             s = self._variable(effect, piece)
             turn = 2 * np.pi * frequency * np.outer(s, harmonics)
             waves = np.stack([np.cos(turn), np.sin(turn)], axis=2).reshape(len(s), -1)
-            columns.append(self._columns(effect, piece, np.hstack([np.ones((len(s), 1)), waves])))
-        tolerances = np.full(len(effect.coefficients), self._size(columns))
-        sums = self._sums(columns)
+            bases.append(np.hstack([np.ones((len(s), 1)), waves]))
+        sums = self._sums(effect, bases)
+        tolerances = np.full(len(effect.coefficients), self._size(sums))
         error = float(self._errors(sums, tolerances[None, :])[0])
         return self._term(effect, {'period': 1 / frequency}, sums, tolerances, error)
 
@@ -278,35 +299,34 @@ class Sketches:
         if key in self.swept:
             return self.swept[key]
         k, count = len(self.precision) + 1, len(frequencies)
-        h = {held: np.zeros((count, k + 2, k + 2)) for held in (False, True)}
-        g = {held: np.zeros((count, k + 2)) for held in (False, True)}
-        shared = self._solve(self._sums(self._no_columns()), NONE)
+        shared = self._solve(self.alone, NONE)
+        responses = self._responses(effect)
+        across = {held: np.zeros((k + 1, 2, count)) for held in (False, True)}
+        among = {held: np.zeros((2, 2, count)) for held in (False, True)}
         own: dict[tuple[int, bool], tuple[np.ndarray, np.ndarray]] = {}
         left = 0.0
-        for i, piece in enumerate(self.pieces):
-            s = self._variable(effect, piece)
-            turn = 2 * np.pi * np.outer(s, frequencies)
-            basis = np.hstack([np.ones((len(s), 1)), np.cos(turn), np.sin(turn)])
-            columns = self._columns(effect, piece, basis)
-            common, waves = np.hstack([piece.parameters, columns[:, :1]]), columns[:, 1:]
-            across = (common.T @ waves).reshape(k, 2, count).transpose(2, 0, 1)
-            cosine, sine = waves[:, :count], waves[:, count:]
-            among = np.empty((count, 2, 2))
-            among[:, 0, 0], among[:, 1, 1] = (cosine**2).sum(axis=0), (sine**2).sum(axis=0)
-            among[:, 0, 1] = among[:, 1, 0] = (cosine * sine).sum(axis=0)
-            h[piece.held][:, :k, :k] += common.T @ common
-            h[piece.held][:, :k, k:] += across
-            h[piece.held][:, k:, :k] += across.transpose(0, 2, 1)
-            h[piece.held][:, k:, k:] += among
-            g[piece.held][:, :k] += common.T @ piece.missed
-            g[piece.held][:, k:] += (piece.missed @ waves).reshape(2, count).T
-            rest = piece.missed - piece.parameters @ shared
+        for i, (piece, response) in enumerate(zip(self.pieces, responses, strict=True)):
+            waves = _waves(self._variable(effect, piece), frequencies)
+            mean = response.with_constant()
+            known = np.vstack([response.parameters, mean, response.missed])
+            beside = (known @ waves).transpose(1, 0, 2)
+            squared, taken = response.squared(waves), response.start @ waves
+            power = np.einsum('ain,bin->abn', squared, squared)
+            power -= np.einsum('ain,bin->abn', taken, taken)
+            across[piece.held] += beside
+            among[piece.held] += power
             sums = own.setdefault(
-                (piece.record, i % 2 == 0), (np.zeros((count, 2, 2)), np.zeros((count, 2)))
+                (piece.record, i % 2 == 0), (np.zeros((2, 2, count)), np.zeros((2, count)))
             )
-            sums[0].__iadd__(among)
-            sums[1].__iadd__((rest @ waves).reshape(2, count).T)
+            sums[0].__iadd__(power)
+            sums[1].__iadd__(beside[k] - np.tensordot(shared, beside[: k - 1], (0, 0)))
+            rest = piece.missed - piece.parameters @ shared
             left += float(rest @ rest)
+        h, g = self._sums(effect, [np.ones((len(r.missed), 1)) for r in responses])
+        for held in (False, True):
+            h[held] = _bordered(h[held], across[held][:k].transpose(2, 0, 1),
+                                among[held].transpose(2, 0, 1))  # fmt: skip
+            g[held] = np.hstack([np.repeat(g[held], count, axis=0), across[held][k].T])
         together = self._errors((h, g), np.full((count, 3), np.inf))
         self.swept[key] = together, self._own_phases(own, np.full(count, left))
         return self.swept[key]
@@ -317,7 +337,8 @@ class Sketches:
         for (record, even), (h, g) in own.items():
             if (record, not even) not in own:
                 continue
-            learned, target = own[record, not even]
+            h, g = h.transpose(2, 0, 1), g.T
+            learned, target = (part.T for part in own[record, not even])
             ridge = 1e-9 * np.trace(learned, axis1=1, axis2=2)[:, None, None] + 1e-300
             x = np.linalg.solve(learned + ridge * np.eye(2), target[:, :, None])[..., 0]
             errors = errors + ((np.matmul(h, x[:, :, None])[..., 0] - 2 * g) * x).sum(axis=1)
@@ -325,24 +346,34 @@ class Sketches:
 
     # --- ridge regression ---------------------------------------------------------------------
 
-    def _no_columns(self) -> list[np.ndarray]:
-        return [np.zeros((len(p.missed), 0)) for p in self.pieces]
-
-    def _size(self, columns: Sequence[np.ndarray]) -> float:
+    def _size(self, sums: tuple[Fold, Fold]) -> float:
         """Standard deviation that is no restriction: far beyond what explains everything."""
-        power = sum(float((c**2).sum()) for c in columns) / max(columns[0].shape[1], 1)
+        k = len(self.precision)
+        responses = [np.diag(h[0])[k:] for h in sums[0].values()]
+        power = float(np.sum(responses)) / max(len(responses[0]), 1)
         return SLACK * float(np.sqrt(sum(self.squares.values()) / max(power, 1e-300)))
 
-    def _sums(self, columns: Sequence[np.ndarray]) -> tuple[Fold, Fold]:
-        """Normal equations of parameters and coefficients on either side, with one batch axis."""
-        k = len(self.precision) + columns[0].shape[1]
-        h = {held: np.zeros((1, k, k)) for held in (False, True)}
-        g = {held: np.zeros((1, k)) for held in (False, True)}
-        for piece, own in zip(self.pieces, columns, strict=True):
-            j = np.hstack([piece.parameters, own])
-            h[piece.held] += j.T @ j
-            g[piece.held] += j.T @ piece.missed
-        return h, g
+    def _sums(self, effect: LearnedEffect, bases: Sequence[np.ndarray]) -> tuple[Fold, Fold]:
+        """Normal equations of parameters and coefficients on either side, with one batch axis.
+
+        Args:
+            effect: The term.
+            bases: Of each piece, the functions where they act, shape (instants, coefficients).
+        """
+        k, n = len(self.precision), bases[0].shape[1]
+        across = {held: np.zeros((1, k, n)) for held in (False, True)}
+        among = {held: np.zeros((1, n, n)) for held in (False, True)}
+        missed = {held: np.zeros((1, n)) for held in (False, True)}
+        responses = self._responses(effect)
+        for piece, response, basis in zip(self.pieces, responses, bases, strict=True):
+            across[piece.held] += response.parameters @ basis
+            among[piece.held] += response.among(basis)
+            missed[piece.held] += response.missed @ basis
+        h, g = self.alone
+        return (
+            {held: _bordered(h[held], across[held], among[held]) for held in h},
+            {held: np.hstack([g[held], missed[held]]) for held in g},
+        )
 
     def _errors(self, sums: tuple[Fold, Fold], tolerances: np.ndarray) -> np.ndarray:
         """What each side leaves of the other, chi2 per sample, shape (batch,).
@@ -391,6 +422,31 @@ class Sketches:
     def _left(self, h: Fold, g: Fold, x: np.ndarray, side: bool) -> np.ndarray:
         curved = np.matmul(h[side], x[:, :, None])[..., 0]
         return self.squares[side] + ((curved - 2 * g[side]) * x).sum(axis=1)
+
+
+def _waves(s: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
+    """Cosines and sines of one turn per period, shape (2, len(s), frequencies).
+
+    Frequencies at equal distances: few of them, each turned on by few steps, are all.
+    """
+    count = len(frequencies)
+    step = float(frequencies[1] - frequencies[0]) if count > 1 else 0.0
+    block = max(1, round(count**0.5))
+    turn = 2 * np.pi * np.outer(s, frequencies[::block])
+    on = 2 * np.pi * step * np.outer(s, np.arange(block))
+    cosine, sine = np.cos(turn)[:, :, None], np.sin(turn)[:, :, None]
+    more, less = np.cos(on)[:, None], np.sin(on)[:, None]
+    found = np.stack([cosine * more - sine * less, sine * more + cosine * less])
+    return found.reshape(2, len(s), -1)[:, :, :count]
+
+
+def _bordered(h: np.ndarray, across: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """[[h, across], [across^T, among]] of each of a batch; of h there may be one for all."""
+    batch, k, n = across.shape
+    found = np.empty((batch, k + n, k + n))
+    found[:, :k, :k], found[:, :k, k:], found[:, k:, k:] = h, across, among
+    found[:, k:, :k] = across.transpose(0, 2, 1)
+    return found
 
 
 def _diagonal(values: np.ndarray) -> np.ndarray:
