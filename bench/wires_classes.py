@@ -22,7 +22,7 @@ from typing import Any
 
 from std_msgs.msg import Bool
 from wires_rig import ROOT, Rig, load
-from wires_rivals import ASKED
+from wires_rivals import ASKED, REQUESTED
 
 from cg_bringup.runs import NodeOf
 from cg_interfaces import topics
@@ -191,17 +191,20 @@ def let_stop_go(rig: Rig) -> None:
 
 RELAYED = {'undo': spoil('well'), 'setup': 'relayed'}
 ON_TOPICS = [
-    Fault('second publisher of the request', 'zero', speak(topics.TORQUE_REQUEST, 500.0),
+    Fault('second publisher of the request', 'zero', speak(REQUESTED, 500.0),
           fall_silent, setup='rival'),
     Fault('second publisher of the command', 'rule', speak(topics.TORQUE_COMMAND, 500.0),
           fall_silent, setup='rival'),
-    Fault('flood of requests', 'zero', speak(topics.TORQUE_REQUEST, 0.0), fall_silent,
+    Fault('flood of requests', 'zero', speak(REQUESTED, 0.0), fall_silent,
           setup='rival'),
     Fault('flood of commands', 'rule', speak(topics.TORQUE_COMMAND, 0.0), fall_silent,
           setup='rival'),
     Fault('request: NaN', 'zero', spoil('nan'), **RELAYED),
     Fault('request: of another joint', 'zero', spoil('joint'), **RELAYED),
-    Fault('request: stamp 25 ms to 1 h old', 'zero', spoil('old {}'), draw=spread(0.025, 3600.0),
+    # The gate stops for what is older than 0.1 s; before that the drive lets no torque act.
+    Fault('request: stamp 25 to 90 ms old', 'rule', spoil('old {}'), draw=spread(0.025, 0.09),
+          **RELAYED),
+    Fault('request: stamp 0.12 s to 1 h old', 'zero', spoil('old {}'), draw=spread(0.12, 3600.0),
           **RELAYED),
     Fault('request: stamp 10 ms to 1 h ahead', 'zero', spoil('ahead {}'),
           draw=spread(0.01, 3600.0), **RELAYED),

@@ -4,7 +4,7 @@ python bench/wires_rivals.py rival     a second publisher of a torque
     speak TOPIC LISTENERS HZ           publish TORQUE there, at 0 Hz as fast as it can; says
                                        the ns at which it has found so many listeners
     quiet                              is no publisher any more
-python bench/wires_rivals.py relay     between a controller on ASKED and /torque_request
+python bench/wires_rivals.py relay     between a controller on ASKED and the gate
     well | nan | joint | old S | ahead S     what becomes of the requests from now on
 """
 
@@ -19,9 +19,11 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from cg_bringup.robot_run import OWNERS
 from cg_interfaces import topics
 from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds, to_stamp
 
+REQUESTED = f'{topics.TORQUE_REQUEST}/{OWNERS[0]}'  # what the gate listens to
 ASKED = '/asked'  # the topic of a controller that is relayed
 TORQUE = 7.0  # N m that no controller here asks for by itself
 PATIENCE = 10.0  # s until listeners are found
@@ -69,7 +71,7 @@ class Relay:
 
     def __init__(self, node: Node):
         self.how, self.seconds = 'well', 0.0
-        self.publisher = node.create_publisher(JointState, topics.TORQUE_REQUEST, SENSOR_QOS)
+        self.publisher = node.create_publisher(JointState, REQUESTED, SENSOR_QOS)
         node.create_subscription(JointState, ASKED, self.on_request, SENSOR_QOS)
 
     def on_request(self, request: JointState) -> None:
