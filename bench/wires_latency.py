@@ -41,6 +41,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, JointState
 from wires_rig import DEVICES, NODES, ROOT, START, Lost, go_first, rig
+from wires_rivals import REQUESTED
 
 from cg_bringup.balance_run import MACHINE, BalanceOptions, balance_nodes
 from cg_bringup.supervisor import supervised
@@ -53,7 +54,6 @@ TABLE = ROOT / 'bench/results/wires_latency.md'
 LOG = ROOT / 'build/wires_latency.log'
 TRACE = ROOT / 'build/wires_latency.trace'
 EPSILON = 0.02  # s, of the observer, on wires as simulated
-ASKED = f'{topics.TORQUE_REQUEST}/balance'  # on wires
 SETTLED = 5.0  # s that it has stood before anything counts
 PUSHED, PUSH = 5.0, 0.2  # s from one push to the next, N s
 STANDS = 0.1  # rad of lean
@@ -221,7 +221,7 @@ def budget(
 
 LINE, STAMPED = 'sample taken to its bytes on the line', 'bytes to /imu, stamped'
 ANSWERS = {
-    '/imu to /state': topics.STATE, '/state to the request': ASKED,
+    '/imu to /state': topics.STATE, '/state to the request': REQUESTED,
     'request to /torque_command': topics.TORQUE_COMMAND,
 }  # fmt: skip
 ACTS = '/torque_command to the SYNC at which it acts'
@@ -254,7 +254,7 @@ def latest(path: Path) -> int:
 def on_wires(seconds: float, first: bool, seed: int) -> Loop:
     """Of a robot on its wires."""
     kinds = {
-        topics.IMU: Imu, topics.STATE: JointState, ASKED: JointState,
+        topics.IMU: Imu, topics.STATE: JointState, REQUESTED: JointState,
         topics.TORQUE_COMMAND: JointState,
     }  # fmt: skip
     with rig(LOG, seed, first, words=('--trace', str(TRACE))) as it:
@@ -358,7 +358,7 @@ def simulated(seconds: float, first: bool, seed: int) -> Loop:
     taken = {h.stamp: h.stamp for h in heard[topics.IMU] if begin <= h.stamp < end}
     marks = {STAMPED: firsts(heard[topics.IMU])}
     marks |= {
-        name: firsts(heard[asked if topic == ASKED else topic])
+        name: firsts(heard[asked if topic == REQUESTED else topic])
         for name, topic in ANSWERS.items()
     }  # fmt: skip
     commands = heard[topics.TORQUE_COMMAND]

@@ -69,7 +69,7 @@ class Piece:
         return len(self.missed) - self.project.shape[1]
 
     def to_torque(self, row: np.ndarray) -> 'Response':
-        """To torques on one joint at the slots.
+        """How the piece responds to torques on one joint, one in each slot.
 
         Args:
             row: Generalised force per torque, shape (n,).
@@ -81,7 +81,7 @@ class Piece:
         )  # fmt: skip
 
     def to_error(self, channel: int) -> 'Response':
-        """To errors of one sensor at its own samples."""
+        """How the piece responds to errors of one sensor, one at each of its samples."""
         own = self.samples == channel
         weight = 1 / self.sigma[own]
         return Response(
@@ -92,15 +92,16 @@ class Piece:
 
 @dataclass(frozen=True)
 class Response:
-    """What a piece does of something at n instants, A, as inner products with all that is known.
+    """How a piece responds to a forcing f at n instants: A f, shape (m,), never formed itself.
 
-    |A f|^2 = |S f|^2 - |L f|^2, with S of n rows at most, where A has one for every sample.
+    Fits ask for inner products only. They come from matrices of n rows at most in place of m:
+    f^T A^T A g = (S f)^T (S g) - (L f)^T (L g).
 
     Attributes:
         parameters: J^T A, shape (k, n).
         missed: r^T A, shape (n,).
-        square: S, shape (rows, n), or its diagonal, shape (n,).
-        start: L, what an initial motion takes of it, shape (2m0, n).
+        square: S, shape (rows, n); where it is diagonal, its diagonal, shape (n,).
+        start: L, what the initial motion explains of the response, shape (2m0, n).
     """
 
     parameters: np.ndarray
@@ -109,25 +110,25 @@ class Response:
     start: np.ndarray
 
     def times(self, carrier: np.ndarray) -> 'Response':
-        """To what is multiplied by a signal first, shape (n,)."""
+        """The response to f times a signal, shape (n,)."""
         return Response(
             self.parameters * carrier, self.missed * carrier, self.square * carrier,
             self.start * carrier,
         )  # fmt: skip
 
     def squared(self, basis: np.ndarray) -> np.ndarray:
-        """S of functions given at the instants: shape (..., n, functions) -> (..., rows, ...)."""
+        """S g of each column g of a basis, shape (..., n, k) -> (..., rows, k)."""
         return self.square @ basis if self.square.ndim == 2 else self.square[:, None] * basis
 
     def with_constant(self) -> np.ndarray:
-        """Inner products of what a constant does with what each instant does, shape (n,)."""
+        """A^T A 1: of a constant forcing with one at each instant, shape (n,)."""
         one = np.ones((len(self.missed), 1))
         own, taken = self.squared(one)[:, 0], (self.start @ one)[:, 0]
         mine = self.square.T @ own if self.square.ndim == 2 else self.square * own
         return mine - self.start.T @ taken
 
     def among(self, basis: np.ndarray) -> np.ndarray:
-        """Inner products of the responses to functions, shape (functions, functions)."""
+        """Inner products of the responses to the columns of a basis, (n, k) -> (k, k)."""
         own, taken = self.squared(basis), self.start @ basis
         return own.T @ own - taken.T @ taken
 

@@ -153,15 +153,16 @@ class Sketches:
         return piece.at_samples[effect.follows][piece.samples == channel]
 
     def _responses(self, effect: LearnedEffect) -> list[Response]:
-        """What each piece does of the term where it is one, by what it follows."""
+        """How each piece responds to the function of a term."""
         place = effect.site.partition(':')[0]
-        found = self._at(place, isinstance(effect, SensorTerm), isinstance(effect, JointTerm))
-        if not isinstance(effect, JointTerm) or not effect.carrier:
-            return found
-        return [r.times(self._carrier(effect, p)) for r, p in zip(found, self.pieces, strict=True)]
+        if isinstance(effect, JointTerm):
+            found = zip(self._responses_at(place, sensor=False, joint=True), self.pieces,
+                        strict=True)  # fmt: skip
+            return [response.times(self._carrier(effect, piece)) for response, piece in found]
+        return self._responses_at(place, sensor=isinstance(effect, SensorTerm), joint=False)
 
-    def _at(self, place: str, sensor: bool, joint: bool) -> list[Response]:
-        """The same of an error of one sensor, or of a torque at one joint or on one leg."""
+    def _responses_at(self, place: str, sensor: bool, joint: bool) -> list[Response]:
+        """To errors of a sensor, to torques at a joint, or, where neither is asked, on a leg."""
         key = place, sensor, joint
         if key in self.responses:
             return self.responses[key]
@@ -349,8 +350,8 @@ class Sketches:
     def _size(self, sums: tuple[Fold, Fold]) -> float:
         """Standard deviation that is no restriction: far beyond what explains everything."""
         k = len(self.precision)
-        responses = [np.diag(h[0])[k:] for h in sums[0].values()]
-        power = float(np.sum(responses)) / max(len(responses[0]), 1)
+        powers = [np.diag(h[0])[k:] for h in sums[0].values()]
+        power = float(np.sum(powers)) / max(len(powers[0]), 1)
         return SLACK * float(np.sqrt(sum(self.squares.values()) / max(power, 1e-300)))
 
     def _sums(self, effect: LearnedEffect, bases: Sequence[np.ndarray]) -> tuple[Fold, Fold]:
@@ -427,7 +428,8 @@ class Sketches:
 def _waves(s: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
     """Cosines and sines of one turn per period, shape (2, len(s), frequencies).
 
-    Frequencies at equal distances: few of them, each turned on by few steps, are all.
+    Frequencies lie at equal distances: each is one of a few, turned on by one of a few steps, so
+    that few cosines are computed.
     """
     count = len(frequencies)
     step = float(frequencies[1] - frequencies[0]) if count > 1 else 0.0
