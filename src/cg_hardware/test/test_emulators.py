@@ -1,5 +1,6 @@
 """The emulated robot: what it tells of an instant is not told before it."""
 
+import json
 import os
 
 import pytest
@@ -33,7 +34,7 @@ def test_a_sample_is_on_the_line_at_its_instant_and_not_before(robot, tmp_path):
 
 
 def test_the_encoder_is_read_between_two_steps_of_the_body(robot):
-    robot.ask('let_go')
+    robot.ask('let_go', 0.0)
     for _ in range(2):
         robot.move()
     counts = []
@@ -43,3 +44,14 @@ def test_the_encoder_is_read_between_two_steps_of_the_body(robot):
     # The swing leg turns by 6 mrad a step, 19 counts; a count of rounding at either end.
     assert abs(counts[2] - counts[0]) > 15
     assert counts[1] - counts[0] == pytest.approx((counts[2] - counts[0]) / 2, abs=1.0)
+
+
+@pytest.mark.parametrize('fault', ['drive_fault 0x2310', 'drive_off'])
+def test_torque_that_a_fault_takes_off_is_off_after_it_also_where_the_body_is_late(robot, fault):
+    robot.drive.acting = 180
+    robot.drive.log.append((3.5 * STEP, 180))  # by a SYNC, while the body is still at zero
+    robot.ask(fault, 3.6 * STEP)
+    report = json.loads(robot.ask('report', 3.7 * STEP))
+    assert report['changes'] == [[3.5 * STEP, 180], [3.6 * STEP, 0]]
+    assert report['acting'] == 0
+    assert report['time'] == 3.7 * STEP

@@ -291,12 +291,17 @@ class EmulatedRobot:
                     self.trace.write(f'sample {instant} {time.time_ns()} {pitch!r}\n')
             self._unsent = []
 
-    def ask(self, line: str) -> str:
-        """Carry out a line of standard input; what to print, if anything."""
+    def ask(self, line: str, now: float) -> str:
+        """Carry out a line of standard input; what to print, if anything.
+
+        Args:
+            line: What is asked for.
+            now: Time in s since the start, as of `serve`: that of a body that is late lies behind.
+        """
         word, *rest = line.split()
         number = float(int(rest[0], 0) if rest[0].startswith('0x') else rest[0]) if rest else 0.0
         if word == 'report':
-            return self._report()
+            return self._report(now)
         device, _, what = word.partition('_')
         if what in ('silent', 'back'):
             (self._silent.add if what == 'silent' else self._silent.discard)(device)
@@ -337,12 +342,12 @@ class EmulatedRobot:
                 ]
             )
         elif word == 'drive_fault':
-            emergency = self.drive.fault(int(number), self.now)
+            emergency = self.drive.fault(int(number), now)
             if self.can_line is not None:
                 self._can.send(emergency)
         elif word == 'drive_off':
             self.drive.dead = True
-            self.drive.log.append((self.now, 0))
+            self.drive.log.append((now, 0))
             self.drive.acting = 0
         elif word == 'drive_on':
             log, self.drive = self.drive.log, self._new_drive()
@@ -380,12 +385,12 @@ class EmulatedRobot:
             return json.dumps({'error': f'{line.strip()!r} is nothing that can be asked for'})
         return ''
 
-    def _report(self) -> str:
+    def _report(self, now: float) -> str:
         changes = self.drive.log.copy()
         self.drive.log.clear()
         late, self.late = self.late, 0.0
         return json.dumps({
-            'time': self.now, 'epoch_ns': self.epoch_ns,
+            'time': now, 'epoch_ns': self.epoch_ns,
             'state': self.drive.state, 'acting': self.drive.acting,
             'changes': changes, 'outputs': self.drive.outputs, 'lean': self.lean,
             'farthest': self.farthest, 'hip': self._hip, 'held': self._held, 'late': late,
@@ -448,7 +453,7 @@ def main() -> int:
                 return 0
             *lines, words[source] = (words[source] + said.decode()).split('\n')
             for line in filter(str.strip, lines):
-                if answer := robot.ask(line):
+                if answer := robot.ask(line, time.monotonic() - robot.begun):
                     print(answer, flush=True)
 
 
