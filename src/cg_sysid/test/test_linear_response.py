@@ -13,7 +13,7 @@ ROW = np.array([0.7, -1.3])
 
 @pytest.fixture
 def piece():
-    """Made up: two coordinates, three sensors that are sampled unevenly and are unlike in noise."""
+    """Made up: two coordinates, three sensors unlike in rate and noise."""
     rng = np.random.default_rng(3)
     project, _ = np.linalg.qr(rng.normal(size=(M, STARTS)))
 
