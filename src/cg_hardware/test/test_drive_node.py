@@ -265,8 +265,28 @@ def test_a_drive_that_was_without_power_has_no_zero(make):
     bench.robot.ask('drive_on')
     bench.wait(0.3)
     assert not bench.call('enable').success  # looked for anew
-    bench.until(lambda: bench.node.drive is not None and bench.node.drive.state is not None)
+    bench.until(lambda: bench.node.drive is not None)
+    found = bench.node.drive
+    # A person who tries again before it has said anything does not lose it again.
+    request, response = Trigger.Request(), Trigger.Response()
+    assert 'has said nothing yet' in bench.node.on_enable(request, response).message
+    assert bench.node.drive is found
+    bench.until(lambda: found.state is not None)
     assert 'the zero of the hip is unknown' in bench.call('enable').message
+
+
+def test_nobody_is_let_go_while_two_speak_to_the_drive(make):
+    bench = make()
+    assert bench.call('zero').success
+    bench.enabled()
+    assert bench.call('disable').success
+    rival = bench.peer.create_publisher(JointState, '/torque_command', SENSOR_QOS)
+    bench.until(lambda: bench.node.commands.get_publisher_count() == 2)
+    assert '2 publishers of the torque' in bench.call('enable').message
+    assert not bench.node.drive.wanted
+    bench.peer.destroy_publisher(rival)
+    bench.until(lambda: bench.node.commands.get_publisher_count() == 1)
+    bench.enabled()
 
 
 def test_voltage_and_temperature_are_told_and_limits_take_the_torque(make):
