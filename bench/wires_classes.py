@@ -4,6 +4,8 @@ zero       the torque is off in time, and no other one comes before a person has
 rule       the same, but the next good command acts again, as how_to/own_hardware.md has it
 balance    nothing that a robot should mind: it stands on
 either     the torque is zero, or the robot stands; no torque acts that is old
+
+Where nothing is done to it, which is a class as well, one sees what a busy host does by itself.
 """
 
 import math
@@ -86,6 +88,7 @@ def either_way(low: float, high: float) -> Callable[[Random], tuple]:
 # Wires
 
 BALANCE = {'expects': 'balance', 'lasts': 1.5}
+NOTHING = Fault('nothing', inflict=lambda rig: None, **BALANCE)
 IMU_BACK = ask('imu_noise 0')
 ON_WIRES = [
     Fault('IMU silent', 'zero', ask('imu_silent'), ask('imu_back')),
@@ -290,8 +293,8 @@ def record_again(rig: Rig) -> None:
 
 
 def be_busy(rig: Rig, seconds: float, impulse: float) -> None:
-    """Others work, and somebody pushes."""
-    with load(BUSY):
+    """Others work, and somebody pushes. Devices have processors of their own meanwhile."""
+    with load(BUSY), rig.devices_first():
         rig.person.wait(seconds / 2)
         rig.robot.ask(f'push {impulse}')
         rig.person.wait(seconds / 2)
@@ -308,7 +311,45 @@ OF_THE_HOST = [
           ), lasts=0.0),
 ]  # fmt: skip
 
-FAULTS = {f.name: f for f in (*ON_WIRES, *OF_NODES, *ON_TOPICS, *OF_THE_HOST)}
+FAULTS = {f.name: f for f in (NOTHING, *ON_WIRES, *OF_NODES, *ON_TOPICS, *OF_THE_HOST)}
+
+
+def of_nodes(told: str) -> tuple[str, ...]:
+    """What becomes of a node, for each of them."""
+    return tuple(f'{name.replace("_", " ")} {told}' for name in NODES)
+
+
+# Kind -> the faults that are of it.
+KINDS: dict[str, tuple[str, ...]] = {
+    'nothing is done': (NOTHING.name,),
+    'a device falls silent': ('IMU silent', 'bus silent'),
+    'unplugged, plugged in': ('IMU unplugged', 'bus unplugged'),
+    'garbage and cut-off frames': (
+        'IMU: noise only', 'IMU: every sample cut off', 'IMU: 1 to 60 bytes of garbage',
+        'IMU: 1 to 3 samples cut off', 'bus: noise only', 'bus: 1 to 40 bytes of garbage',
+    ),
+    'wrong sums, no numbers': (
+        'IMU: every sum wrong', 'IMU: 1 to 3 sums wrong', 'IMU: no numbers (NaN)',
+    ),
+    'frozen device': ('IMU frozen',),
+    'clock jumps': ('IMU: its clock jumps',),
+    'frames lost, frames of others': (
+        'bus: 1 to 3 frames lost', 'bus: 1 to 40 frames of others',
+    ),
+    'heartbeat lost': ("bus: the host's heartbeat lost",),
+    'fault of the drive': ('drive: a fault of its own', 'drive switched off'),
+    'node killed': of_nodes('killed'),
+    'node stopped, continued': (
+        *of_nodes('stopped, continued'), 'balance held up for 30 to 80 ms',
+    ),
+    'node restarted': of_nodes('restarted'),
+    'two publishers': ('second publisher of the request', 'second publisher of the command'),
+    'flood of messages': ('flood of requests', 'flood of commands'),
+    'spoilt requests': tuple(f.name for f in ON_TOPICS if f.name.startswith('request:')),
+    'emergency stop': ('emergency stop by topic', 'emergency stop by service'),
+    'disk full': ('disk full while recording',),
+    'busy host': (f'{BUSY} busy processes',),
+}  # fmt: skip
 
 
 # What a robot needs for them

@@ -40,6 +40,7 @@ from cg_interfaces.domains import own_domain  # noqa: E402
 START = (0.03, 0.03)  # rad of the legs when a person lets go
 PATIENCE = 60.0  # s for a robot to stand, from cold
 UPRIGHT = 0.03  # rad of lean that is standing still
+LOOKS, LOOK = 4, 0.12  # how often it is seen to stand still, and s between two looks
 TRIES = 6
 ANSWER = 3.0  # s for a service, before it is called once more
 DEVICES, NODES = 20, 10  # real-time priorities of a robot that goes first
@@ -189,9 +190,22 @@ class Rig:
         for name in names if self.first else ():
             go_first(self.supervisor.processes[name], NODES)
 
-    def hold(self) -> None:
-        """Catch the robot where it is."""
-        self.robot.ask('hold')
+    @contextlib.contextmanager
+    def devices_first(self) -> Iterator[None]:
+        """Devices go before all else on this machine, as those that have their own processors."""
+        pid = self.robot.process.pid
+        before = os.sched_getscheduler(pid), os.sched_getparam(pid)
+        go_first(self.robot.process, DEVICES)
+        try:
+            yield
+        finally:
+            os.sched_setscheduler(pid, *before)
+
+    def stands(self) -> bool:
+        """Whether nobody needs to bring it back."""
+        report = self.report()
+        enabled = report['state'] == 'operation enabled' and not report['held']
+        return enabled and self.person.stage == 'active' and abs(report['lean']) < UPRIGHT
 
     def bring_back(self) -> int:
         """Make it stand, whatever has happened to it; all processes are there.
@@ -264,8 +278,8 @@ class Rig:
         """Wait until it stands still."""
         still = 0
         deadline = time.monotonic() + 8.0
-        while still < 4:
-            self.person.wait(0.25)
+        while still < LOOKS:
+            self.person.wait(LOOK)
             report = self.report()
             if report['state'] != 'operation enabled' or report['held']:
                 raise Lost(f'the drive is {report["state"]}, the robot {self.person.stage}')
