@@ -52,6 +52,7 @@ class Fault:
         lasts: S that it is watched.
         setup: Of the rig that it needs, of SETUPS.
         examine: What else there is to say of it, once it is over and before it is undone.
+        crowds: Whether it takes the processors itself; then devices have their own meanwhile.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Fault:
     lasts: float = 0.3
     setup: str = 'plain'
     examine: Callable[[Rig], dict[str, Any]] = field(default=lambda rig: {})
+    crowds: bool = False
 
 
 def ask(words: str) -> Callable[..., None]:
@@ -198,10 +200,10 @@ ON_TOPICS = [
           fall_silent, setup='rival'),
     Fault('second publisher of the command', 'rule', speak(topics.TORQUE_COMMAND, 500.0),
           fall_silent, setup='rival'),
-    Fault('flood of requests', 'zero', speak(REQUESTED, 0.0), fall_silent,
-          setup='rival'),
+    Fault('flood of requests', 'zero', speak(REQUESTED, 0.0), fall_silent, setup='rival',
+          crowds=True),
     Fault('flood of commands', 'rule', speak(topics.TORQUE_COMMAND, 0.0), fall_silent,
-          setup='rival'),
+          setup='rival', crowds=True),
     Fault('request: NaN', 'zero', spoil('nan'), **RELAYED),
     Fault('request: of another joint', 'zero', spoil('joint'), **RELAYED),
     # The gate stops for what is older than 0.1 s; before that the drive lets no torque act.
@@ -293,8 +295,8 @@ def record_again(rig: Rig) -> None:
 
 
 def be_busy(rig: Rig, seconds: float, impulse: float) -> None:
-    """Others work, and somebody pushes. Devices have processors of their own meanwhile."""
-    with load(BUSY), rig.devices_first():
+    """Others work, and somebody pushes."""
+    with load(BUSY):
         rig.person.wait(seconds / 2)
         rig.robot.ask(f'push {impulse}')
         rig.person.wait(seconds / 2)
@@ -303,12 +305,12 @@ def be_busy(rig: Rig, seconds: float, impulse: float) -> None:
 OF_THE_HOST = [
     Fault('disk full while recording', inflict=fill_disk, undo=record_again,
           draw=lambda random: (random.randint(0, 200_000),), setup='recorded',
-          examine=examine_recording, expects='balance', lasts=2.0),
+          examine=examine_recording, expects='balance', lasts=2.0, crowds=True),
     Fault(f'{BUSY} busy processes', 'either', be_busy,
           draw=lambda random: (
               round(random.uniform(2.0, 5.0), 3),
               round(random.choice((-1, 1)) * random.uniform(0.1, 0.4), 3),
-          ), lasts=0.0),
+          ), lasts=0.0, crowds=True),
 ]  # fmt: skip
 
 FAULTS = {f.name: f for f in (NOTHING, *ON_WIRES, *OF_NODES, *ON_TOPICS, *OF_THE_HOST)}

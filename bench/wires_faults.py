@@ -28,7 +28,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -184,7 +184,8 @@ def served(
                         it = stack.enter_context(rig(LOG, devices, first, **needs))
                         row['robots'] = 1
                         began = time.monotonic()
-                    row |= trial(it, fault, random)
+                    with it.devices_first() if fault.crowds else nullcontext():
+                        row |= trial(it, fault, random)
                     for name in row.setdefault('died', it.dead()):
                         it.start(name)
                     row['tries'] = 0 if it.stands() else it.bring_back()
