@@ -8,6 +8,7 @@ either     the torque is zero, or the robot stands; no torque acts that is old
 Where nothing is done to it, which is a class as well, one sees what a busy host does by itself.
 """
 
+import contextlib
 import math
 import os
 import resource
@@ -244,9 +245,13 @@ class SmallDisk:
             size = (self.bag / JOURNAL_NAME).stat().st_size + left
             resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
             return
-        room = os.statvfs(self.path)
         with self.ballast.open('wb') as file:
-            os.posix_fallocate(file.fileno(), 0, max(1, room.f_bavail * room.f_frsize - left))
+            for _ in range(100):  # the recorder may have taken some of it in between
+                room = os.statvfs(self.path)
+                with contextlib.suppress(OSError):
+                    free = room.f_bavail * room.f_frsize
+                    os.posix_fallocate(file.fileno(), 0, max(1, free - left))
+                    break
 
     def empty(self) -> None:
         """Somebody makes room."""
@@ -385,6 +390,8 @@ def recorded() -> Iterator[dict[str, Any]]:
     disk = SmallDisk(Path(tempfile.mkdtemp(prefix='cg_disk_')))
 
     def change(nodes: dict[str, NodeOf]) -> None:
+        disk.empty()
+        shutil.rmtree(disk.bag, ignore_errors=True)  # of the robot before
         bag = {'bag': str(disk.bag)}
         nodes['recorder'] = NodeOf('cg_sysid', 'recorder_node', bag, ending=CLOSING)
 

@@ -175,7 +175,8 @@ class RecorderNode(Node):
         return all(self.subscriptions_to[topic].get_publisher_count() for topic in self.needed)
 
     def _fail(self, error: OSError) -> None:
-        self.get_logger().error(f'recording stopped: {error}')
+        path, why = self.recording.path, error.strerror or error
+        self.get_logger().error(f'{path}: recording stopped: {why}; what came before is kept')
         self.finished, self.exit_status = True, 1
 
     def _offered_qos(self, topic: str) -> list[dict]:
@@ -186,7 +187,11 @@ class RecorderNode(Node):
         try:
             result = self.recording.close()
         except (ValueError, OSError) as error:
-            self.get_logger().error(f'{self.recording.path}: {error}')
+            path, log = self.recording.path, self.get_logger()
+            if self.exit_status:  # the disk that stopped the recording is still full
+                log.warning(f'{path} is no bag yet: make room, then `cg recover {path}`')
+            else:
+                log.error(f'{path}: {error}; `cg recover {path}` makes a bag of what there is')
             self.exit_status = 1
             return
         if result.messages == 0:
