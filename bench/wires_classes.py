@@ -310,7 +310,7 @@ def be_busy(rig: Rig, seconds: float, impulse: float) -> None:
 OF_THE_HOST = [
     Fault('disk full while recording', inflict=fill_disk, undo=record_again,
           draw=lambda random: (random.randint(0, 200_000),), setup='recorded',
-          examine=examine_recording, expects='balance', lasts=2.0, crowds=True),
+          examine=examine_recording, expects='balance', lasts=2.0),
     Fault(f'{BUSY} busy processes', 'either', be_busy,
           draw=lambda random: (
               round(random.uniform(2.0, 5.0), 3),

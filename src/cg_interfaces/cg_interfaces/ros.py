@@ -207,6 +207,7 @@ def run(
     settings: type[Settings],
     args: list[str] | None = None,
     niceness: int = 0,
+    parting: int = 0,
 ) -> int:
     """Make a node and spin it until it is told to stop (stop_request.py) or has `finished`.
 
@@ -216,6 +217,7 @@ def run(
         args: Of the command line; those of this process if None.
         niceness: Of this process from now on, 0 to keep what it has. An ordinary user may not
             lower it; then it stays.
+        parting: Niceness while it ends, where that is work that nobody waits for.
 
     Returns:
         Exit status: 0 for a clean end, the node's `exit_status` if it has one, 2 for arguments
@@ -259,6 +261,8 @@ def run(
         try:
             spin(node, lambda: stop.requested)
         finally:
+            if parting:
+                take_priority(parting)
             getattr(node, 'close', lambda: None)()
             _see_off(node)
             node.destroy_node()

@@ -33,6 +33,7 @@ PROGRESS_PERIOD = 0.002  # s
 READY_PERIOD = 0.02  # s
 SETTLING = 0.5  # s without news after which all publishers are known; nothing waits for it
 NICENESS = -15  # far before ordinary work, behind nothing that keeps a machine alive
+PARTING = 10  # niceness while a bag is made of what came in: a robot may still stand
 
 
 class RecorderNode(Node):
@@ -239,7 +240,7 @@ def qos_entry(profile: QoSProfile) -> dict:
 
 def main(args: list[str] | None = None) -> int:
     """Entry point of `ros2 run cg_sysid recorder_node`."""
-    return run(RecorderNode, RecorderSettings, args, NICENESS)
+    return run(RecorderNode, RecorderSettings, args, NICENESS, PARTING)
 
 
 if __name__ == '__main__':
