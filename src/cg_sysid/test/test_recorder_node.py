@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from cg_interfaces.domains import own_domain  # noqa: E402
 from cg_interfaces.ros import LATCHED_QOS, MACHINE_QOS, to_stamp  # noqa: E402
-from cg_sysid.records.recover import needs_recovery, recover  # noqa: E402
+from cg_sysid.records.recover import JOURNAL_NAME, needs_recovery, recover  # noqa: E402
 
 pytestmark = pytest.mark.alone
 
@@ -182,6 +183,30 @@ def test_started_while_data_flow_the_bag_begins_with_all_topics_and_the_note(tmp
     for stamps in stored.values():
         assert stamps[0] == first
         assert stamps == [stamp for stamp in sender.sent if first <= stamp <= stamps[-1]]
+
+
+def test_a_full_disk_ends_the_recording_with_one_error_and_keeps_what_came_before(tmp_path):
+    bag, log = tmp_path / 'bag', tmp_path / 'log'
+    with make_sender() as sender, log.open('w') as output:
+        process = start_recorder(bag, stderr=output)
+        sender.wait_for_recorder(process)
+        sender.send(0.5)
+        # A limit of file sizes is a disk that is full for this process alone.
+        journal = bag / JOURNAL_NAME
+        most = journal.stat().st_size + 20_000
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most, most))
+        sender.send(0.5)
+        assert process.wait(timeout=30.0) == 1
+    said = log.read_text()
+    errors = [line for line in said.splitlines() if '[ERROR]' in line]
+    assert len(errors) == 1
+    assert f'{bag}: recording stopped: ' in errors[0]
+    assert 'Traceback' not in said
+    recover(bag)
+    stored = stamps_of(bag)
+    assert set(stored) == set(TOPICS)
+    for stamps in stored.values():
+        assert set(stamps) <= set(sender.sent)
 
 
 @pytest.mark.parametrize(

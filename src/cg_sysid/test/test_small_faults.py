@@ -94,6 +94,39 @@ def test_a_cause_is_named_among_small_faults(nominal, effect, values):
         assert abs(value - true) < 4 * sigma + 5e-3 * abs(true)
 
 
+FRICTIONS = ('stribeck_friction', 'presliding_friction', 'quadratic_friction', 'torque_bias')
+
+
+def _with_bristles(machine):
+    return machine.with_effect(
+        'presliding_friction', None, torque=0.4, deflection=2.1e-3, damping=0.5
+    )
+
+
+@pytest.mark.slow
+def test_friction_that_gives_way_a_little_is_consistent(nominal):
+    records = _records(_with_bristles(nominal), 12.0)
+    found = diagnose(nominal, records, Options(effects=FRICTIONS, workers=1))
+    assert found.baseline.held.normalised_error > settings.NOISE.quick
+    assert (found.verdict, found.causes) == ('consistent', ())
+    assert any(f.startswith('presliding_friction.deflection = ') for f in found.findings)
+
+
+@pytest.mark.slow
+def test_friction_that_gives_way_a_little_is_no_cause_and_hides_none(nominal):
+    """Bristles as sound machines have them, on top of Stribeck friction that nobody stated."""
+    machine = _with_bristles(nominal).with_effect(
+        'stribeck_friction', None, torque=1.0, stribeck_rate=0.6
+    )
+    records = _records(machine, 12.0)
+    found = diagnose(nominal, records, Options(effects=FRICTIONS, workers=1))
+    assert [cause.label for cause in found.causes] == ['stribeck_friction']
+    assert any(f.startswith('presliding_friction.deflection = ') for f in found.findings)
+    value, sigma, _ = found.causes[0].parameters['torque']
+    assert abs(value - 1.0) < 4 * sigma + 5e-3
+    assert found.extended.held.normalised_error < settings.NOISE.quick
+
+
 @pytest.mark.slow
 def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
     """Together they come to the noise, and no cause without them does."""
@@ -245,6 +278,10 @@ def test_a_small_delay_is_no_cause_where_only_beliefs_speak_for_it(nominal, late
         ('encoder_offset', {'offset': (-5e-4, 1e-5, 'rad')}, True),
         ('torque_bias', {'bias': (1e-6, 1e-7, 'N m')}, False),
         ('actuator_delay', {}, False),
+        ('presliding_friction', {'torque': (0.6, 1e-3, 'N m'), 'deflection': (2e-3, 2e-5, 'rad')},
+         True),
+        ('presliding_friction', {'torque': (0.6, 1e-3, 'N m'), 'deflection': (4e-3, 2e-5, 'rad')},
+         False),
     ],
 )
 def test_no_cause_is_as_small_as_a_small_fault(label, sizes, small):

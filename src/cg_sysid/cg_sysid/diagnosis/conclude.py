@@ -16,7 +16,7 @@ from cg_sysid.diagnosis.causes import as_in, named_causes, with_events
 from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.late_samples import late_samples
 from cg_sysid.diagnosis.result import Cause, Diagnosis, Verdict, gains_of
-from cg_sysid.diagnosis.small_faults import shapes, told_small_faults
+from cg_sysid.diagnosis.small_faults import shapes, told_small_faults, with_law
 from cg_sysid.diagnosis.summary import summary_of
 from cg_sysid.diagnosis.thorough import thorough
 from cg_sysid.diagnosis.workspace import Workspace
@@ -38,7 +38,7 @@ TURNS = 3  # periods that a term of a short stretch of an angle is tried with
 def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     """The answer when nothing more is earned: look-alikes, causes, last fits, verdict."""
     unmodelled = None
-    if work.left(final):
+    if work.left(with_law(work, final)):
         unmodelled, stand = what_remains(
             nominal, final, work.added(final), work.train, work.held, work.carry_out
         )
@@ -49,7 +49,7 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
             unmodelled = characterise(final, work.train, work.held, work.carry_out)
     final = less_mishaps(work, nominal, final)
     causes = named_causes(work, nominal, final)
-    final = thorough(work, final)
+    final = thorough(work, with_law(work, final))
     causes = [with_events(work, final, as_in(final, cause)) for cause in causes]
     left = work.left(final)
     wandering = wandering_number(work, final) if left else None

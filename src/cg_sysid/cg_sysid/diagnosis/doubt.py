@@ -4,6 +4,7 @@ import logging
 from dataclasses import replace
 
 from cg_sysid.diagnosis.comparing import compare
+from cg_sysid.diagnosis.small_faults import with_law
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.search.candidates import Outcome, Task, chi2
@@ -51,7 +52,7 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
             log.info('without %s: %s', label, lean)
             return None
         # Who would take the place has to come up to what is there.
-        compare(work, lean, final.train.normalised_error)
+        compare(work, lean, with_law(work, final).train.normalised_error)
     comparison = work.comparisons[key]
     # The fit beside the others may have been better, or the only one that went through.
     ranked = comparison.of(label)

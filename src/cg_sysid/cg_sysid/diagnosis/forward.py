@@ -1,7 +1,13 @@
 """Forward selection: one effect after the other, until nothing more is earned."""
 
 from cg_sysid.diagnosis.comparing import compare, done, refitted
-from cg_sysid.diagnosis.small_faults import bare, of_size, rather_one_cause, with_small_faults
+from cg_sysid.diagnosis.small_faults import (
+    bare,
+    of_size,
+    rather_one_cause,
+    sound_law,
+    with_small_faults,
+)
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search.candidates import Outcome
@@ -18,6 +24,9 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
             comparison = of_size(work, compare(work, o))
             o, winner = comparison.base, comparison.winner()
             work.note(comparison, winner[0].label if winner else '')
+            work.law = sound_law(work, comparison) if winner is None else None
+            if work.law is not None:
+                break
         if winner is not None:
             work.found = winner[1]
             o = work.found = refitted(work, winner[1])

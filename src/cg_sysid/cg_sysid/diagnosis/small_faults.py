@@ -16,8 +16,14 @@ from cg_sysid.search.model_selection import (
     explained_by,
     settled,
 )
-from cg_sysid.search.nuisance import as_sound_robots, faults_among, nuisances, with_nuisances
-from cg_sysid.search.ranking import Candidate
+from cg_sysid.search.nuisance import (
+    SOUND_LAWS,
+    as_sound_robots,
+    faults_among,
+    nuisances,
+    with_nuisances,
+)
+from cg_sysid.search.ranking import Candidate, effect_name
 from cg_sysid.search.standings import title_of
 from cg_sysid.text import measured
 
@@ -40,6 +46,33 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
         return found if settled(found) else o  # only beliefs are at stake
     # Beside a large cause they would explain a little of it; then they can wait.
     return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
+
+
+def sound_law(work: Workspace, comparison: Comparison) -> Outcome | None:
+    """The base with a law that sound machines follow, if that takes nearly all that is left.
+
+    It is no cause, and too dear to be let go in every fit. But what it takes is none's to explain,
+    so that the search ends there.
+    """
+    base = comparison.base
+    for candidate, o in comparison.ranked:
+        law, label = SOUND_LAWS.get(effect_name(candidate.label)), candidate.label
+        sound = as_sound_robots(label, candidate.parameters)
+        little = above_noise(o) < (1 - settings.DOUBT.nearly_all) * above_noise(base)
+        if law and sound and candidate.reason == sound[0] and little:
+            name = f'{label}.{law[0]}'
+            bounds = {**o.task.bounds, name: settings.DOUBT.as_found}
+            model = o.model.with_values({name: o.train.model.values[name]})
+            task = replace(o.task, model=model, effect=None, bounds=bounds)
+            return replace(o, task=task, model=model, label=base.label)
+    return None
+
+
+def with_law(work: Workspace, final: Outcome) -> Outcome:
+    """What stands, with the law that takes what is left of it, if there is one."""
+    if work.law is None or work.added(work.law) != work.added(final):
+        return final
+    return work.law
 
 
 def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcome | None:
@@ -152,7 +185,8 @@ def small_faults_of(o: Outcome) -> list[str]:
     found = []
     for label in sorted(nuisances(o.model, o.task.bounds)):
         for name, (value, sigma, unit) in parameters_of(o, label).items():
-            if abs(value) > settings.DOUBT.shows * sigma:
+            bound = f'{label}.{name}' in o.task.bounds
+            if bound and abs(value) > settings.DOUBT.shows * sigma:
                 found.append(
                     f'{label}.{name} = {measured(value, sigma, unit)}: as sound robots have it'
                 )

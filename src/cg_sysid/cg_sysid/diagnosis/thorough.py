@@ -5,7 +5,7 @@ from dataclasses import replace
 from cg_sysid.diagnosis.workspace import Workspace, structure
 from cg_sysid.identification.identify import Fit
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, one_minimum
+from cg_sysid.search.candidates import Outcome, Task, chi2, one_minimum, started_from
 from cg_sysid.search.model_selection import settled
 from cg_sysid.search.ranking import per_output
 from cg_sysid.search.standings import title_of
@@ -39,7 +39,9 @@ def fitted_thoroughly(work: Workspace, o: Outcome) -> Outcome:
     """From where it stands, and from other minima of the same structure."""
     task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                 iterations=settings.FITTING.thorough_iterations)  # fmt: skip
-    tasks = [replace(task, warm_starts=(start.train,)) for start in (o, *other_minima(work, o))]
+    # Another minimum may have been sought with shapes let go that are not here.
+    starts = (started_from(s.train, o.model, task.bounds) for s in other_minima(work, o))
+    tasks = [replace(task, warm_starts=(start,)) for start in (o.train, *starts)]
     title = f'thorough fits of {title_of(work.added(o))}'
     found = [fitted for fitted in work.halving.fit(tasks, title) if isinstance(fitted, Outcome)]
     return min([o, *found], key=chi2)

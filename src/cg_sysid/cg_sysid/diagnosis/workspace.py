@@ -46,6 +46,7 @@ class Workspace:
         torques: What torques say of candidates, by the same.
         thorough: Thorough fits by structure.
         joint: Fits to all records, or why there is none.
+        law: What stands, with a law that sound machines follow (small_faults.sound_law).
         found: What stands, for an answer before the end.
         under_way: The base of the comparison under way.
         rounds: What was tried, in order.
@@ -73,6 +74,7 @@ class Workspace:
         self.torques: dict[tuple[frozenset[str], bool], Scores] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | Failure] = {}
+        self.law: Outcome | None = None
         self.found: Outcome
         self.under_way: Outcome
         self.rounds: list[Round] = []

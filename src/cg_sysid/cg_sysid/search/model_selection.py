@@ -181,11 +181,12 @@ class ModelSelection:
                 f'{100 * settings.SELECTION.mishap:.0f} % allowed'
             )
         own = own_parameters(o)
-        reasons += at_edge(o)
+        # What sound robots have lies at the edge of what is a cause.
+        sound = as_sound_robots(o.label, own)
+        reasons += sound or at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
         if at_noise(base) or left > 1 - settings.SELECTION.accounts or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
-        reasons += as_sound_robots(o.label, own)
         reasons += self._implausible(o)
         return Candidate(
             label=o.label,

@@ -201,7 +201,9 @@ class Doubt:
         proposed: Experiments named for each cause with rivals.
         outstanding: Share of the squared error in one record that is worth a word.
         outstanding_times: And as many times its even share.
-        nearly_all: Of the squared error above the noise: a cause of another shape than its law's.
+        nearly_all: Of the squared error above the noise: a cause of another shape than its law's,
+            or a law that sound machines follow.
+        as_found: Relative, within which the number that tells such a law sound stays from then on.
     """
 
     deeper: int = 3
@@ -214,6 +216,7 @@ class Doubt:
     outstanding: float = 0.2
     outstanding_times: int = 4
     nearly_all: float = 0.9
+    as_found: float = 0.01
 
 
 SCREENING = Screening()
