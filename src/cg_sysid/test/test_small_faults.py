@@ -123,8 +123,20 @@ def test_friction_that_gives_way_a_little_is_no_cause_and_hides_none(nominal):
     assert [cause.label for cause in found.causes] == ['stribeck_friction']
     assert any(f.startswith('presliding_friction.deflection = ') for f in found.findings)
     value, sigma, _ = found.causes[0].parameters['torque']
+    # Four standard deviations, and what integrators differ by.
     assert abs(value - 1.0) < 4 * sigma + 5e-3
     assert found.extended.held.normalised_error < settings.NOISE.quick
+
+
+@pytest.mark.slow
+@pytest.mark.evidence
+def test_friction_that_gives_way_a_little_does_not_end_the_search_for_what_it_leaves(nominal):
+    machine = _with_bristles(nominal).with_effect(
+        'stribeck_friction', None, torque=1.0, stribeck_rate=0.6
+    ).with_effect('torque_bias', None, bias=0.5)  # fmt: skip
+    records = _records(machine, 12.0)
+    found = diagnose(nominal, records, Options(effects=FRICTIONS, workers=1))
+    assert {cause.label for cause in found.causes} == {'stribeck_friction', 'torque_bias'}
 
 
 @pytest.mark.slow

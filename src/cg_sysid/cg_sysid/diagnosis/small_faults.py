@@ -52,14 +52,14 @@ def sound_law(work: Workspace, comparison: Comparison) -> Outcome | None:
     """The base with a law that sound machines follow, if that takes nearly all that is left.
 
     It is no cause, and too dear to be let go in every fit. But what it takes is none's to explain,
-    so that the search ends there.
+    so that the search ends there; it must come near the noise, or something else is wrong too.
     """
     base = comparison.base
+    most = min((1 - settings.DOUBT.nearly_all) * above_noise(base), settings.NOISE.quick - 1)
     for candidate, o in comparison.ranked:
         law, label = SOUND_LAWS.get(effect_name(candidate.label)), candidate.label
         sound = as_sound_robots(label, candidate.parameters)
-        little = above_noise(o) < (1 - settings.DOUBT.nearly_all) * above_noise(base)
-        if law and sound and candidate.reason == sound[0] and little:
+        if law and sound and candidate.reason == sound[0] and above_noise(o) < most:
             name = f'{label}.{law[0]}'
             bounds = {**o.task.bounds, name: settings.DOUBT.as_found}
             model = o.model.with_values({name: o.train.model.values[name]})
