@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.diagnosis import small_faults
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.catalogue import load_experiment
@@ -14,7 +16,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, one_minimum, screen
+from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
 
 EFFECTS = (
@@ -128,15 +130,26 @@ def test_friction_that_gives_way_a_little_is_no_cause_and_hides_none(nominal):
     assert found.extended.held.normalised_error < settings.NOISE.quick
 
 
-@pytest.mark.slow
-@pytest.mark.evidence
-def test_friction_that_gives_way_a_little_does_not_end_the_search_for_what_it_leaves(nominal):
-    machine = _with_bristles(nominal).with_effect(
-        'stribeck_friction', None, torque=1.0, stribeck_rate=0.6
-    ).with_effect('torque_bias', None, bias=0.5)  # fmt: skip
-    records = _records(machine, 12.0)
-    found = diagnose(nominal, records, Options(effects=FRICTIONS, workers=1))
-    assert {cause.label for cause in found.causes} == {'stribeck_friction', 'torque_bias'}
+@pytest.mark.parametrize(
+    ('deflection', 'left', 'ends'), [(2e-3, 0.4, True), (2e-3, 5.0, False), (4e-3, 0.4, False)]
+)
+def test_such_friction_ends_the_search_only_near_the_noise(
+    nominal, monkeypatch, deflection, left, ends
+):
+    name = 'presliding_friction'
+    above = {'base': 100.0, name: left}  # chi2/N less 1
+    monkeypatch.setattr(small_faults, 'above_noise', lambda o: above[o.label])
+    sizes = {'deflection': (deflection, 2e-5, 'rad')}
+    model = nominal.with_effect(name, None, torque=0.4, deflection=deflection)
+    fit_there = SimpleNamespace(model=model)
+    o = Outcome(
+        Task(nominal, (name, None)), name, model, fit_there, fit_there, (), 0.0, 0, {}, ((), ()),
+    )  # fmt: skip
+    candidate = SimpleNamespace(
+        label=name, parameters=sizes, reason='; '.join(as_sound_robots(name, sizes))
+    )
+    comparison = SimpleNamespace(base=replace(o, label='base'), ranked=((candidate, o),))
+    assert (small_faults.sound_law(comparison) is not None) == ends
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
             comparison = of_size(work, compare(work, o))
             o, winner = comparison.base, comparison.winner()
             work.note(comparison, winner[0].label if winner else '')
-            work.law = sound_law(work, comparison) if winner is None else None
+            work.law = sound_law(comparison) if winner is None else None
             if work.law is not None:
                 break
         if winner is not None:

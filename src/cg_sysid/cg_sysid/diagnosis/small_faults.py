@@ -48,7 +48,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
 
 
-def sound_law(work: Workspace, comparison: Comparison) -> Outcome | None:
+def sound_law(comparison: Comparison) -> Outcome | None:
     """The base with a law that sound machines follow, if that takes nearly all that is left.
 
     It is no cause, and too dear to be let go in every fit. But what it takes is none's to explain,
