@@ -303,10 +303,16 @@ def test_a_small_delay_is_no_cause_where_only_beliefs_speak_for_it(nominal, late
         ('encoder_offset', {'offset': (-5e-4, 1e-5, 'rad')}, True),
         ('torque_bias', {'bias': (1e-6, 1e-7, 'N m')}, False),
         ('actuator_delay', {}, False),
-        ('presliding_friction', {'torque': (0.6, 1e-3, 'N m'), 'deflection': (2e-3, 2e-5, 'rad')},
-         True),
-        ('presliding_friction', {'torque': (0.6, 1e-3, 'N m'), 'deflection': (4e-3, 2e-5, 'rad')},
-         False),
+        (
+            'presliding_friction',
+            {'torque': (0.6, 1e-3, 'N m'), 'deflection': (2e-3, 2e-5, 'rad')},
+            True,
+        ),
+        (
+            'presliding_friction',
+            {'torque': (0.6, 1e-3, 'N m'), 'deflection': (4e-3, 2e-5, 'rad')},
+            False,
+        ),
     ],
 )
 def test_no_cause_is_as_small_as_a_small_fault(label, sizes, small):
