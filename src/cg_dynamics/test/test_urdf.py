@@ -377,12 +377,41 @@ def test_a_tilted_base_is_as_tilted_gravity():
     np.testing.assert_allclose(tilted(motion, u, p), leaning(motion, u, p0), rtol=1e-9)
 
 
+def test_a_push_on_a_link_gives_momentum_to_what_carries_it():
+    """In no gravity the momenta M dq/dt become its impulses, and those of no other joint."""
+    text = random_tree(8, 4)
+    body = robot(text).mechanism
+    link = next(b for b in body.bodies if 1 < len(body.joints_to(b)) < 4)
+    carriers = body.joints_to(link)
+    impulses = {name: 1e-3 * (k + 1) * (-1) ** k for k, name in enumerate(carriers)}
+    model = robot(text).with_values({'gravity': 0.0}).with_effect(
+        'external_push', link, instant=0.06, duration=0.01,
+        **{f'impulse_{name}': value for name, value in impulses.items()},
+    )  # fmt: skip
+    units = {p.name: p.unit for p in model.effects[0].parameters}
+    assert all(
+        units[f'impulse_{name}'] == ('N s' if body.slides(name) else 'N m s') for name in carriers
+    )
+    time = np.arange(0, 0.12, 0.001)
+    u = np.column_stack([np.zeros((len(time), 4)), time])
+    motion = np.concatenate([np.random.default_rng(3).normal(size=4), np.zeros(4)])
+    states, _ = simulate(model, Setup(), time, u, motion)
+    q, p = ca.SX.sym('q', 4), ca.SX.sym('p', len(body.parameters))
+    named = dict(zip((x.name for x in body.parameters), ca.vertsplit(p), strict=True))
+    mass = ca.Function('mass', [q, p], [body.mass_matrix(q, named)])
+    momenta = np.asarray(mass(states[-1, :4], list(nominal(body).values()))) @ states[-1, 4:8]
+    expected = [impulses.get(name, 0.0) for name in body.coordinates]
+    # What the motion itself changes is of second order: rates are below 0.1.
+    np.testing.assert_allclose(momenta, expected, atol=2e-5)
+
+
 @pytest.mark.parametrize('name', sorted(LIBRARY))
 def test_every_effect_acts_wherever_it_says_it_can(name):
     model = robot(random_tree(8, 2), driven=['joint_0'])
     kind = LIBRARY[name]
     for site in kind.sites(model.mechanism) if kind.applies([Setup()]) else ():
-        values = {p.name: p.starts[0] for p in kind.parameters_in(model.mechanism) if p.starts}
+        parameters = kind(model.mechanism, site).parameters
+        values = {p.name: p.starts[0] for p in parameters if p.starts}
         f, p = equations(model.with_effect(name, site, **values))
         x = np.random.default_rng(1).normal(0, 0.1, f.size1_in(0))
         assert np.isfinite(np.asarray(f(x, np.ones(f.size1_in(1)), p))).all()

@@ -4,6 +4,7 @@ import numpy as np
 
 from cg_description.model_file import ModelFile
 from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.effects.effect import TIME
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model
@@ -58,6 +59,8 @@ def recorded(model: Model, seconds: float, seed: int, setup: Setup = Setup()) ->
     rates = np.gradient(ways, SAMPLE, axis=0)
     x = compiled.initial_state(np.zeros(2 * n), np.zeros(compiled.nu), p)
     states, torques = np.zeros((len(time), compiled.nx)), np.zeros((len(time), compiled.nu))
+    if TIME in compiled.input_names:
+        torques[:, compiled.input_names.index(TIME)] = time
     for k in range(len(time)):
         states[k] = x
         torques[k, :n] = 60 * (ways[k] - x[:n]) + 3 * (rates[k] - x[n : 2 * n])

@@ -82,12 +82,28 @@ def test_the_cause_is_worth_a_look(believed, name, at, sizes):
     assert len(kept) < len(candidates) / 2
 
 
+@pytest.mark.parametrize('link', ['hip', 'thigh', 'shank'])
+def test_a_push_is_worth_a_look_on_the_link_that_it_is_on(believed, link):
+    true = believed.with_values(OFF)
+    about = believed.mechanism.joints_to(link)
+    # Near the base, as the robot's own torques are larger there, a push is seen less well.
+    sizes = {f'impulse_{joint}': 0.3 * (-1) ** k for k, joint in enumerate(about)}
+    pushed = true.with_effect('external_push', link, instant=1.83, duration=0.04, **sizes)
+    train = prepare(believed, [recorded(pushed, 4.0, 1), recorded(true, 4.0, 2)])
+    candidates = candidates_for(believed, [Setup()])
+    found = scores(believed, train, candidates, {})
+    assert found.pushed == (('external_push', link),)
+    kept = found.worth(candidates)
+    assert [c for c in kept if c[0] == 'external_push'] == [('external_push', link)]
+
+
 def test_a_sound_robot_has_little_to_look_at(believed):
     train = data(believed.with_values(OFF), believed)
     found = scores(believed, train, candidates_for(believed, [Setup()]), {})
     # The bias of smoothing is no noise: a few laws gain by it, none by much.
     assert np.median(list(found.gains.values())) < SEEN
     assert max(found.fitted.values()) < 10 * SEEN
+    assert not found.pushed
 
 
 def test_torques_are_told_where_there_was_no_time_to_look(believed):

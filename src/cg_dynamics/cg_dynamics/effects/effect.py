@@ -168,10 +168,9 @@ class Effect:
         if self.slides(mechanism):
             self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
 
-    @classmethod
-    def parameters_in(cls, mechanism: Mechanism) -> tuple[Parameter, ...]:
-        """Its parameters in the plane, or in space where that takes others."""
-        return cls.parameters
+    def parameters_in(self, mechanism: Mechanism) -> tuple[Parameter, ...]:
+        """Its parameters at its site: in space, or far from the base, there may be others."""
+        return self.parameters
 
     @property
     def label(self) -> str:

@@ -1,6 +1,7 @@
 """Somebody pushes the robot once."""
 
 import math
+from dataclasses import replace
 
 import casadi as ca
 
@@ -9,7 +10,7 @@ from cg_dynamics.parameter import Parameter
 
 
 class ExternalPush(StanceEffect):
-    """A horizontal force at the hip, a pulse over the time of the record.
+    """A horizontal force at the hip, or any on a link, a pulse over the time of the record.
 
     A rectangle whose edges are smeared by a logistic density, with s its scale and w its length:
 
@@ -22,12 +23,16 @@ class ExternalPush(StanceEffect):
 
     A push is an event of a record, not a property of the machine: every record has its own
     impulse and instant, and most have none.
+
+    Where on a link of a robot somebody pushes, and which way, its joints do not tell apart. They
+    tell the torque that the push has about each of them, from the link to the base, and of that
+    the impulse: one for each joint.
     """
 
     name = 'external_push'
     summary = (
-        'Something pushes the hip forward once: a smooth pulse of force around an instant, with '
-        'a given impulse; both are found for each record.'
+        'Something pushes the hip forward, or a link of a robot, once: a smooth pulse of force '
+        'around an instant, with a given impulse; both are found for each record.'
     )
     contains = ('tether_force',)
     parameters = (
@@ -51,12 +56,41 @@ class ExternalPush(StanceEffect):
     extra_inputs = (TIME,)
     largest_step = 0.002
 
+    @classmethod
+    def sites(cls, mechanism):
+        """The hip of a compass gait; the links of a robot."""
+        return mechanism.bodies if mechanism.dimensions == 3 else super().sites(mechanism)
+
+    def parameters_in(self, mechanism):
+        """At a link an impulse about each joint that carries it, the nearest first."""
+        if mechanism.dimensions == 2:
+            return self.parameters
+        impulse, *others = self.parameters
+        return (
+            *(
+                replace(
+                    impulse, name=f'impulse_{joint}',
+                    unit='N s' if mechanism.slides(joint) else 'N m s',
+                    description=f'integral of what it does to {joint}',
+                )
+                for joint in reversed(mechanism.joints_to(self.site))
+            ),
+            *others,
+        )  # fmt: skip
+
+    def acts(self, values):
+        """Where any impulse is not 0."""
+        return any(values[p.name] for p in self.parameters if p.neutral is not None)
+
     def force(self, body, z, p):
-        """(PUSH) through the hip's Jacobian."""
+        """(PUSH) through the hip's Jacobian, or about each joint."""
         late, duration, round_ = p[TIME] - p['instant'], p['duration'], p['roundness']
         edge = 2 * duration * ca.sqrt(3 * round_) / math.pi
         length = duration * ca.sqrt(12 * (1 - round_))
         rise, fall = (ca.tanh((late + half) / edge) for half in (length / 2, -length / 2))
         pulse = (rise - fall) / (2 * length)
+        if body.mechanism.dimensions == 3:
+            impulses = [p.get(f'impulse_{name}', 0.0) for name in body.mechanism.coordinates]
+            return ca.vertcat(*impulses) * pulse, []
         hip, _ = body.hip()
         return ca.gradient(hip[0], body.q) * p['impulse'] * pulse, []

@@ -36,10 +36,9 @@ class GroundSlope(Effect):
         ),
     )  # fmt: skip
 
-    @classmethod
-    def parameters_in(cls, mechanism):
+    def parameters_in(self, mechanism):
         """In space the base can be tilted about two axes."""
-        return cls.parameters if mechanism.dimensions == 2 else TILT
+        return self.parameters if mechanism.dimensions == 2 else TILT
 
     def acts(self, values):
         """Where any of its angles is not 0."""

@@ -34,10 +34,9 @@ class Payload(BodyEffect):
         ),
     )  # fmt: skip
 
-    @classmethod
-    def parameters_in(cls, mechanism):
+    def parameters_in(self, mechanism):
         """In space its place is a point in the frame of the link."""
-        return cls.parameters if mechanism.dimensions == 2 else (cls.parameters[0], *PLACE)
+        return self.parameters if mechanism.dimensions == 2 else (self.parameters[0], *PLACE)
 
     def energies(self, body, p):
         """Energies of the point mass."""

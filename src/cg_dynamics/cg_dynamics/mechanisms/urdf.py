@@ -269,6 +269,21 @@ class Urdf(Mechanism):
             )
         return ca.mtimes([to_tree.T, matrix, to_tree])
 
+    def joints_to(self, body: str) -> tuple[str, ...]:
+        """Joints that move a body, the one at the base first; of those that follow their leaders.
+
+        Args:
+            body: Of `bodies`.
+        """
+        above = {joint.child: joint for joint in self.description.joints}
+        found: list[str] = []
+        while body in above:
+            joint = above[body]
+            if joint.kind != 'fixed':
+                found.append(joint.mimic[0] if joint.mimic else joint.name)
+            body = joint.parent
+        return tuple(dict.fromkeys(reversed(found)))
+
     def inertials(self, values) -> dict[str, Inertial | None]:
         """What each body weighs by these parameters: name of its link -> inertia of all that is
         fixed to that link, in its frame; None of links that are fixed to it.

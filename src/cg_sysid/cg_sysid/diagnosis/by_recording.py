@@ -107,10 +107,10 @@ def numbers_of(
     for name, at in (*stated, *lacking):
         if name not in LIBRARY:
             continue
-        kind = LIBRARY[name]
-        parameters = kind.parameters_in(model.mechanism)
+        effect = LIBRARY[name](model.mechanism, at)
+        parameters = effect.parameters
         own = any(p.each for p in parameters)
-        plain = not (own or kind.states or kind.extra_inputs) and parameters[0].neutral == 0.0
+        plain = not (own or effect.states or effect.extra_inputs) and parameters[0].neutral == 0.0
         if plain and sum(p.free for p in parameters) == 1:
             yield name, at
 

@@ -128,9 +128,9 @@ def described(cause: Cause) -> str:
 def _of_single_records(cause: Cause) -> tuple[str, ...]:
     """Names of what happened in single records, as a push; none where nothing surely did."""
     kind = LIBRARY.get(effect_name(cause.label))
-    if kind is None or not cause.events:
+    if kind is None or not cause.events or all(p.each != 'record' for p in kind.parameters):
         return ()
-    return tuple(p.name for p in kind.parameters if p.each == 'record')
+    return tuple(next(iter(cause.events.values())))
 
 
 def _happened(cause: Cause, names: Sequence[str]) -> list[str]:

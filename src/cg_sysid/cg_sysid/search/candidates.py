@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
-from cg_dynamics.effects.effect import CLOCKS, TIME
+from cg_dynamics.effects.effect import CLOCKS, TIME, Effect
 from cg_dynamics.errors import DynamicsError
-from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
@@ -20,7 +19,7 @@ from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
 from cg_sysid.search import excerpt as excerpt
 from cg_sysid.search import settings
-from cg_sysid.search.events import seek_events, undisturbed
+from cg_sysid.search.events import event_names, seek_events, undisturbed
 from cg_sysid.search.nuisance import Bounds, turning
 from cg_sysid.text import measured
 
@@ -125,12 +124,12 @@ def candidates_for(
     return found
 
 
-def starts_of(name: str, mechanism: Mechanism) -> list[dict[str, float]]:
+def starts_of(effect: Effect) -> list[dict[str, float]]:
     """Values of an effect's parameters from which its identification sets out."""
     grids = [
         [(p.name, start) for start in p.starts] if p.choice or (p.free and not p.each)
         else [(p.name, p.default if p.neutral is None else p.neutral)]
-        for p in LIBRARY[name].parameters_in(mechanism)
+        for p in effect.parameters
     ]  # fmt: skip
     return [
         dict(point)
@@ -282,11 +281,12 @@ def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
 
 def _surest(found: Fit, label: str) -> list[np.ndarray]:
     """An effect's own values in the data sets in which something surely happened."""
-    count = len(found.own)
-    place = [k for k, u in enumerate(found.own) if u.name.startswith(f'{label}.')]
-    own = [motion[len(motion) - count :][place] for motion in found.motions]
+    names = [u.name for u in found.own]
+    sizes, instant = event_names(found.model, label)
+    place = [names.index(name) for name in (*sizes, instant)]
+    own = [motion[len(motion) - len(names) :][place] for motion in found.motions]
     sure = [
-        abs(values[0]) / max(sigmas[place[0]], 1e-300)
+        float(np.max((np.abs(values) / np.maximum(sigmas[place], 1e-300))[: len(sizes)]))
         for values, sigmas in zip(own, found.own_sigmas, strict=True)
     ]
     order = sorted(range(len(own)), key=lambda i: -sure[i])
@@ -304,15 +304,14 @@ def _unseen_shapes(found: Fit) -> tuple[str, ...]:
 
 def cost_of(task: Task) -> int:
     """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
-    name = _label(task).partition('@')[0]
-    kind = LIBRARY[name]
-    events = any(p.each == 'record' for p in kind.parameters)
-    swept = any(p.swept for p in kind.parameters)
+    effect = _tried(task)
+    assert effect is not None
+    swept = any(p.swept for p in effect.parameters)
     return (
-        100 * events
-        + 10 * bool(kind.states)
+        100 * eventful(task)
+        + 10 * bool(effect.states)
         + 10 * swept
-        + len(starts_of(name, task.model.mechanism))
+        + len(starts_of(effect))
     )
 
 
@@ -356,10 +355,8 @@ def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
 
 def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     model, warm_starts = next(_starting_models(task)), task.warm_starts
-    if (
-        not warm_starts
-        and len(starts_of(task.effect[0], task.model.mechanism) if task.effect else ()) > 1
-    ):
+    effect = _tried(task)
+    if not warm_starts and effect and len(starts_of(effect)) > 1:
         warm_starts = _first_seconds(task, train)
     if not warm_starts:
         return _whole(task, model, train, None, task.iterations)
@@ -402,9 +399,18 @@ def _whole(
     )  # fmt: skip
 
 
+def _tried(task: Task) -> Effect | None:
+    """The effect that is tried."""
+    if task.effect is None:
+        return None
+    name, at = task.effect
+    return LIBRARY[name](task.model.mechanism, at)
+
+
 def _declared(task: Task) -> tuple[Parameter, ...]:
     """Parameters of the effect that is tried."""
-    return LIBRARY[task.effect[0]].parameters_in(task.model.mechanism) if task.effect else ()
+    effect = _tried(task)
+    return effect.parameters if effect else ()
 
 
 def eventful(task: Task) -> bool:
@@ -632,18 +638,16 @@ def _starting_models(task: Task):
         yield task.model
         return
     name, at = task.effect
-    label = _label(task)
-    small = any(effect.label == label for effect in task.model.effects)
-    base = task.model.without_effect(label) if small else task.model
-    for start in starts_of(name, base.mechanism):
+    tried = LIBRARY[name](task.model.mechanism, at)
+    small = any(effect.label == tried.label for effect in task.model.effects)
+    base = task.model.without_effect(tried.label) if small else task.model
+    for start in starts_of(tried):
         yield base.with_effect(name, at, **start | turning(base, name, at))
 
 
 def _label(task: Task) -> str:
-    if task.effect is None:
-        return task.model.name
-    name, at = task.effect
-    return LIBRARY[name](task.model.mechanism, at).label
+    effect = _tried(task)
+    return effect.label if effect else task.model.name
 
 
 def with_priors_of(fitted: Model, base: Model, label: str) -> Model:
@@ -681,7 +685,8 @@ def parameters_of(o: Outcome, label: str) -> dict[str, tuple[float, float, str]]
             shared[p.name] = chosen, 0.0, p.unit
     events = events_of(o, label)
     fitted = [events[name] for name in o.data_sets[0] if name in events]
-    surest = max(fitted or events.values(), key=_sureness, default={})
+    sizes = _sizes(o.model, label)
+    surest = max(fitted or events.values(), key=lambda e: _sureness(e, sizes), default={})
     return {**surest, **shared}
 
 
@@ -709,7 +714,7 @@ def events_in(
     found: Fit, names: Sequence[str], label: str
 ) -> dict[str, dict[str, tuple[float, float, str]]]:
     """What surely happened, by one fit to the records of these names; as `events_of`."""
-    events = {}
+    events, sizes = {}, _sizes(found.model, label)
     for name, motion, sigmas in zip(names, found.motions, found.own_sigmas, strict=True):
         values = motion[len(motion) - len(found.own) :]
         row = {
@@ -717,14 +722,20 @@ def events_in(
             for u, v, s in zip(found.own, values, sigmas, strict=True)
             if u.name.startswith(f'{label}.')
         }
-        if row and _sureness(row) > settings.EVENTS.sure:
+        if row and _sureness(row, sizes) > settings.EVENTS.sure:
             events[name] = row
     return events
 
 
-def _sureness(event: Mapping[str, tuple[float, float, str]]) -> float:
-    size, sigma, _ = next(iter(event.values()))
-    return abs(size) / max(sigma, 1e-300)
+def _sizes(model: Model, label: str) -> tuple[str, ...]:
+    """Those of an effect's own values in a record that are 0 where nothing happens."""
+    own = next((e.parameters for e in model.effects if e.label == label), ())
+    return tuple(p.name for p in own if p.each and p.neutral is not None)
+
+
+def _sureness(event: Mapping[str, tuple[float, float, str]], sizes: Sequence[str]) -> float:
+    """Standard deviations by which the surest size of an event differs from 0."""
+    return max(abs(event[name][0]) / max(event[name][1], 1e-300) for name in sizes)
 
 
 def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
@@ -748,11 +759,8 @@ def prior_conflicts(o: Outcome) -> dict[str, float]:
 
 def too_small(o: Outcome) -> list[str]:
     """An effect whose size is as good as none is not what helped."""
-    kind = LIBRARY.get(o.label.partition('@')[0])
-    if kind is None:
-        return []
-    first = kind.parameters_in(o.model.mechanism)[0]
-    if first.neutral is None or not np.isfinite(first.neutral) or first.each:
+    first = next(iter(_declared(o.task)), None)
+    if first is None or first.neutral is None or not np.isfinite(first.neutral) or first.each:
         return []
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
     # Within their bounds small faults may take any part of it: that says nothing of its size.
@@ -767,8 +775,7 @@ def undetermined_size(o: Outcome) -> list[str]:
 
     A limit that was never reached, a stiffness that nothing bends: what acts is something else.
     """
-    kind = LIBRARY.get(o.label.partition('@')[0])
-    name = kind.parameters_in(o.model.mechanism)[0].name if kind else ''
+    name = next((p.name for p in _declared(o.task)), '')
     if f'{o.label}.{name}' not in o.train.undetermined:
         return []
     return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
@@ -795,8 +802,7 @@ def at_edge(o: Outcome) -> list[str]:
     physics ends with the range.
     """
     found = []
-    kind = LIBRARY.get(o.label.partition('@')[0])
-    declared = kind.parameters_in(o.model.mechanism) if kind else ()
+    declared = _declared(o.task)
     optional = {f'{o.label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
     ends = {f'{o.label}.{p.name}': p.ends for p in declared}
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):

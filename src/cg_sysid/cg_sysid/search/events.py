@@ -22,6 +22,8 @@ from cg_sysid.identification.unknowns import IdentificationError, awake, own_unk
 from cg_sysid.search import settings
 from cg_sysid.search.nuisance import Bounds
 
+SEEN = 1e-9  # share of what a size does that the initial motion could not do as well
+
 
 def seek_events(
     model: Model,
@@ -33,20 +35,20 @@ def seek_events(
     """DataSet name -> full name -> guess of its own value.
 
     Args:
-        model: Has an effect of which every record has a size and an instant; its other values
-            are taken as they are.
+        model: Has an effect of which every record has sizes and an instant; its other values are
+            taken as they are.
         data_sets: Each is looked at by itself.
         label: Of the effect.
         known: What else each data set has of its own, and as far as it is known this.
         elsewhere: Sizes and instants in other data sets; they may be those of these as well.
     """
-    names = [u.name for u in own_unknowns(model) if u.name.startswith(f'{label}.')]
+    sizes, instant = event_names(model, label)
     known = known or {}
     if data_sets and all(
-        set(names) <= set(known.get(data_set.name, ())) for data_set in data_sets
+        {*sizes, instant} <= set(known.get(data_set.name, ())) for data_set in data_sets
     ):
         return {data_set.name: dict(known[data_set.name]) for data_set in data_sets}
-    seeking = _Seeking(model, names, known)
+    seeking = _Seeking(model, sizes, instant, known)
     guesses = [seeking.alone(data_set) for data_set in data_sets]
     # What happened in one record may have happened at the same time in another.
     surest = sorted(guesses, key=lambda g: g.error / g.quiet)[: settings.EVENTS.followed]
@@ -56,6 +58,14 @@ def seek_events(
         data_set.name: seeking.beside(data_set, guess.event)
         for data_set, guess in zip(data_sets, guesses, strict=True)
     }
+
+
+def event_names(model: Model, label: str) -> tuple[tuple[str, ...], str]:
+    """Full names of the sizes that an effect has in each record, 0 where none, and the instant."""
+    own = [p for p in model.effect(label).parameters if p.each == 'record']
+    (instant,) = (p.name for p in own if p.neutral is None)
+    sizes = tuple(f'{label}.{p.name}' for p in own if p.neutral is not None)
+    return sizes, f'{label}.{instant}'
 
 
 def undisturbed(model: Model, data_sets: Sequence[DataSet], bounds: Bounds) -> Fit | None:
@@ -102,7 +112,7 @@ def _piece_errors(model: Model, found: Sequence[DataSet]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Guess:
-    """Size and instant in a data set, and its error (chi2/N) with the event and without."""
+    """Sizes and instant in a data set, and its error (chi2/N) with the event and without."""
 
     event: np.ndarray
     error: float
@@ -111,11 +121,17 @@ class _Guess:
 
 @dataclass(frozen=True)
 class _Seeking:
-    """A search of single data sets for size and instant, beside what else is known of each."""
+    """A search of single data sets for sizes and instant, beside what else is known of each."""
 
     model: Model
-    names: Sequence[str]
+    sizes: tuple[str, ...]
+    instant: str
     known: Mapping[str, Mapping[str, float]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of an event's values, in order."""
+        return (*self.sizes, self.instant)
 
     def beside(self, data_set: DataSet, event: np.ndarray) -> dict[str, float]:
         """All that the data set has of its own, by name."""
@@ -124,13 +140,14 @@ class _Seeking:
 
     def alone(self, data_set: DataSet) -> _Guess:
         """The best that this data set alone knows."""
-        nothing = np.array([0.0, self.model.values[self.names[1]]])
+        nothing = np.array([*(0.0 for _ in self.sizes), self.model.values[self.instant]])
         quiet = self._fit(data_set, nothing, 8)
         guess = _Guess(nothing, quiet.normalised_error, quiet.normalised_error)
         found = quiet.own_by_name([data_set])[data_set.name]
         _, motion = in_data_set(awake(self.model), quiet.motions[0])
         others = {name: value for name, value in found.items() if name not in self.names}
-        starts = _small_events(self.model.with_values(others), data_set, motion, self.names)
+        model = self.model.with_values(others)
+        starts = _small_events(model, data_set, motion, self.sizes, self.instant)
         return self.follow(data_set, guess, starts)
 
     def follow(self, data_set: DataSet, guess: _Guess, starts: Sequence[np.ndarray]) -> _Guess:
@@ -142,7 +159,7 @@ class _Seeking:
                 continue
             own = found.own_by_name([data_set])[data_set.name]
             event = np.array([own[name] for name in self.names])
-            inside = 0.0 <= event[1] - data_set.since <= data_set.duration
+            inside = 0.0 <= event[-1] - data_set.since <= data_set.duration
             if inside and found.normalised_error < guess.error:
                 guess = replace(guess, event=event, error=found.normalised_error)
         return guess
@@ -153,35 +170,40 @@ class _Seeking:
 
 
 def _small_events(
-    model: Model, data_set: DataSet, motion: np.ndarray, names: Sequence[str]
+    model: Model, data_set: DataSet, motion: np.ndarray, sizes: Sequence[str], instant: str
 ) -> list[np.ndarray]:
     """Sizes and instants of the events that lower the error most, best first."""
     compiled = compile_model(awake(model), data_set.setup)
-    size, instant = (compiled.parameter_names.index(name) for name in names)
+    at = [compiled.parameter_names.index(name) for name in sizes]
+    when = compiled.parameter_names.index(instant)
     p = parameter_vector(model, data_set.setup)
-    p[size] = 0.0
+    p[at] = 0.0
     u = data_set.inputs_for(compiled.input_names)
     m2 = len(motion)
     x0, by_motion, _ = compiled.initial_sensitivity(motion, u[0], p)
-    s0 = np.column_stack([by_motion, np.zeros(compiled.nx)])
-    column = np.where(np.array(compiled.free) == names[0], m2, -1)
-    grid = _instants(model.with_values({names[0]: 0.0}), data_set)
-    gains, sizes = np.zeros(len(grid)), np.zeros(len(grid))
+    s0 = np.column_stack([by_motion, np.zeros((compiled.nx, len(sizes)))])
+    columns = {name: m2 + k for k, name in enumerate(sizes)}
+    column = np.array([columns.get(name, -1) for name in compiled.free])
+    grid = _instants(model.with_values(dict.fromkeys(sizes, 0.0)), data_set)
+    gains, found = np.zeros(len(grid)), np.zeros((len(grid), len(sizes)))
     for k, t in enumerate(grid):
-        p[instant] = data_set.since + t
+        p[when] = data_set.since + t
         normal, _, _ = compiled.normal(
             data_set.time, u, x0, s0, p, column, data_set.outputs, 1 / data_set.sigma
         )
         h, g = normal.hessian, normal.gradient
         # What the initial motion could do as well does not count.
-        own_h = h[m2, m2] - h[m2, :m2] @ np.linalg.lstsq(h[:m2, :m2], h[:m2, m2], rcond=None)[0]
-        own_g = g[m2] - h[m2, :m2] @ np.linalg.lstsq(h[:m2, :m2], g[:m2], rcond=None)[0]
-        if own_h > 1e-9 * h[m2, m2]:
-            gains[k], sizes[k] = own_g**2 / own_h, -own_g / own_h
+        by_start = np.linalg.lstsq(h[:m2, :m2], np.column_stack([h[:m2, m2:], g[:m2]]), rcond=None)
+        own = np.column_stack([h[m2:, m2:], g[m2:]]) - h[m2:, :m2] @ by_start[0]
+        own_h, own_g = own[:, :-1], own[:, -1]
+        seen = np.diag(own_h) > SEEN * np.diag(h)[m2:]
+        own_h = own_h[np.ix_(seen, seen)]
+        found[k, seen] = -np.linalg.lstsq(own_h, own_g[seen], rcond=SEEN)[0]
+        gains[k] = -own_g @ found[k]
     peaks, _ = scipy.signal.find_peaks(np.concatenate([[0.0], gains, [0.0]]))
     order = sorted(peaks - 1, key=lambda k: -gains[k])
     return [
-        np.array([sizes[k], data_set.since + grid[k]]) for k in order[: settings.EVENTS.followed]
+        np.array([*found[k], data_set.since + grid[k]]) for k in order[: settings.EVENTS.followed]
     ]
 
 

@@ -11,13 +11,16 @@ in standard deviations of what the base leaves. D costs no fit and no compilatio
     a sensor                       of the motion that it would make of the measured one
     a delay                        of the torque by time, or of the motion
 
+A push is sought where it would be: in sums of some consecutive rows, at each place of the records.
+Of the links that explain the largest as well as any, the one nearest to the base has it.
+
 Those that gain most are then fitted by torque error, at once with the numbers of the base: what
 is far from its start is far from linear. What has states of its own, as a flexible drive, has no
 D; it is looked at on the joints of which the torques are worst explained. A robot of six joints
 has 150 candidates, and a fit of one takes seconds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -42,6 +45,10 @@ FITTED = 16  # candidates that are fitted by torque, the best first
 KEPT = 8  # of these, that are looked at
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
+PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
+BLOCK = 12  # rows, 0.5 s
+QUIET = 0.9  # share of the blocks at least in which nobody pushes
+STANDS_OUT = 4.0  # ratio of what a push gains to what any of these blocks does
 
 
 @dataclass(frozen=True)
@@ -52,11 +59,13 @@ class Scores:
         gains: (effect, place) -> nats that it could gain by the score; of those that have a D.
         fitted: Of the best of these, without those of sensors and delays: nats by a torque fit.
         worst: Joints, those of which the torques are worst explained first.
+        pushed: What pushes once, where it may have: (effect, place).
     """
 
     gains: dict[tuple[str, str | None], float]
     fitted: dict[tuple[str, str | None], float]
     worst: tuple[str, ...]
+    pushed: tuple[tuple[str, str | None], ...] = ()
 
     def worth(self, candidates: Sequence[tuple[str, str | None]]) -> list[tuple[str, str | None]]:
         """Those to be looked at."""
@@ -76,9 +85,10 @@ class Scores:
         unseen = {
             (name, at)
             for name, at in candidates
-            if (name, at) not in self.gains and (at is None or _joint(at) in self.worst[:WORST])
+            if (name, at) not in self.gains and not _happens(name)
+            and (at is None or _joint(at) in self.worst[:WORST])
         }
-        return [c for c in candidates if c in seen or c in unseen]
+        return [c for c in candidates if c in seen or c in unseen or c in self.pushed]
 
     def best(self) -> list[tuple[tuple[str, str | None], float]]:
         """Candidates that torque fits speak for, and their nats, the best first."""
@@ -144,8 +154,53 @@ def scores(
     by_fit = dict(zip(follow, gained, strict=True))
     noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
-    free = [name for name in model.mechanism.kinematics(train[0].setup).names]
-    return Scores(gains, by_fit, tuple(free[k] for k in order))
+    free = model.mechanism.kinematics(train[0].setup).names
+    error = left[: residual.size].reshape(residual.shape)
+    pushes = {c: _push(model, c, error, free) for c in candidates if _happens(c[0])}
+    return Scores(gains, by_fit, tuple(free[k] for k in order), _nearest(pushes))
+
+
+def _happens(name: str) -> bool:
+    """Whether an effect is one of single records, as a push."""
+    return any(p.each == 'record' for p in LIBRARY[name].parameters)
+
+
+def _push(
+    model: Model, candidate: tuple[str, str | None], error: np.ndarray, free: Sequence[str]
+) -> np.ndarray:
+    """Nats that a push on a link gains, the largest of each block of the rows.
+
+    Args:
+        model: The base.
+        candidate: (effect, place).
+        error: Of the torques, in standard deviations, (rows, m).
+        free: Names of the m coordinates.
+    """
+    effect = LIBRARY[candidate[0]](model.mechanism, candidate[1])
+    acting = {p.name for p in effect.parameters if p.neutral is not None}
+    about = [k for k, joint in enumerate(free) if f'impulse_{joint}' in acting]
+    total = np.cumsum(np.vstack([np.zeros(error.shape[1]), error]), axis=0)[:, about]
+    gains = np.zeros(BLOCK * -(-len(error) // BLOCK))
+    for n in PULSES:
+        own = ((total[n:] - total[:-n]) ** 2).sum(axis=1) / n / 2
+        gains[: len(own)] = np.maximum(gains[: len(own)], own)
+    return gains.reshape(-1, BLOCK).max(axis=1)
+
+
+def _nearest(
+    pushes: Mapping[tuple[str, str | None], np.ndarray],
+) -> tuple[tuple[str, str | None], ...]:
+    """The push that is worth a fit, if any: of those that gain as much, the nearest to the base.
+
+    Most blocks are without one. What stands out of them as it does elsewhere is an error of the
+    model: friction that turns within a window.
+    """
+    best = max((float(gains.max()) for gains in pushes.values()), default=0.0)
+    near = [
+        c for c, gains in pushes.items()
+        if gains.max() > max(SEEN, best - SEEN, STANDS_OUT * np.quantile(gains, QUIET))
+    ]  # fmt: skip
+    return tuple(sorted(near, key=lambda c: float(pushes[c].sum()))[:1])
 
 
 def _sensed(name: str) -> bool:
@@ -167,7 +222,8 @@ def _gain_by_fit(
     without = model.without_effect(label) if small else model
     own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
     extended = [
-        without.with_effect(name, at, **start) for start in starts_of(name, model.mechanism)
+        without.with_effect(name, at, **start)
+        for start in starts_of(LIBRARY[name](model.mechanism, at))
     ]
     found = torque_error.fits_by_torque(
         extended, train, None, own, scale=base.scale, at=base.values
@@ -223,8 +279,6 @@ def _columns(
     # Without bodies gravity pulls at nothing: what turns it has no D either.
     if effect.states or set(effect.extra_inputs) & set(CLOCKS) or overrides(effect, 'up'):
         return None
-    if any(p.each == 'record' for p in effect.parameters):
-        return None
     body = model.mechanism
     assert isinstance(body, Urdf)
     bare = Model(
@@ -236,7 +290,7 @@ def _columns(
         if other.label != effect.label and other.site == effect.site and not other.states:
             bare = bare.with_effect(other.name, other.at, **model.values_of(other))
     found = []
-    for start in starts_of(name, body):
+    for start in starts_of(effect):
         acting = bare.with_effect(name, at, **start)
         columns = [
             _one_column(acting, effect.label, problem, motion)
