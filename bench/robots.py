@@ -210,7 +210,7 @@ def made(case: Case, folder: Path) -> tuple[Path, list[Path], dict[str, float]]:
     body = Urdf(parse(text), robot.driven)
     bags, records = [], []
     for k in range(robot.records):
-        recording = record(robot, secret, 100 * case.seed + k)
+        recording = record(robot, secret, 100 * case.seed + k, k)
         first = START + round(k * (robot.seconds + PAUSE) * NS_PER_S)
         bags.append(folder / f'moves_{k}')
         write_bag(bags[-1], robot, recording, first)

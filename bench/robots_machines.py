@@ -71,6 +71,13 @@ class Robot:
         """Its description."""
         return (Path(__file__).parent / 'robots_urdf' / f'{self.name}.urdf').read_text()
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """That move, each the child of its joint."""
+        child = {j.get('name'): j.find('child').get('link')
+                 for j in Xml.fromstring(self.urdf).iter('joint')}  # fmt: skip
+        return tuple(child[joint] for joint in self.joints)
+
     def friction(self) -> np.ndarray:
         """Dry friction of each joint by its URDF, read without the code that is to be judged."""
         robot = Xml.fromstring(self.urdf)
@@ -124,6 +131,7 @@ class Secret:
         torque: Joint torques more, of (time, q, v).
         delivered: Torque of the motors, of the commanded one.
         read: Readings of the encoders, of the true positions, (n, joints).
+        push: Who pushes in one of the recordings, or None.
         command_delay: Of the drives, s.
         sensor_delay: Of the encoders, s.
         turns: Rate over which the robot's own dry friction turns; 0 for MuJoCo's.
@@ -139,9 +147,38 @@ class Secret:
     torque: Law | None = None
     delivered: Callable[[np.ndarray], np.ndarray] = lambda torque: torque
     read: Callable[[np.ndarray], np.ndarray] = lambda q: q
+    push: 'Push | None' = None
     command_delay: float = 0.0
     sensor_delay: float = 0.0
     turns: float = TURNS
+
+
+@dataclass(frozen=True)
+class Push:
+    """A force at a point of a link, a half sine of time.
+
+    Attributes:
+        link: Which.
+        point: In its frame, m.
+        force: Its largest, in the frame of the base, N.
+        middle: When it is that, s.
+        width: How long it lasts, s.
+        recording: In which it happens.
+    """
+
+    link: str
+    point: tuple[float, float, float]
+    force: tuple[float, float, float]
+    middle: float
+    width: float
+    recording: int
+
+    def act(self, data: mujoco.MjData) -> None:
+        """Acts at this instant."""
+        late, body = (data.time - self.middle) / self.width, data.body(self.link)
+        force = np.cos(np.pi * late) * np.array(self.force) if abs(late) < 0.5 else np.zeros(3)
+        place = body.xpos + body.xmat.reshape(3, 3) @ self.point
+        body.xfrc_applied[:] = [*force, *np.cross(place - body.xipos, force)]
 
 
 @dataclass(frozen=True)
@@ -195,14 +232,16 @@ def compiled(robot: Robot, secret: Secret, step: float) -> mujoco.MjModel:
     return model
 
 
-def record(robot: Robot, secret: Secret, seed: int) -> Recording:
+def record(robot: Robot, secret: Secret, seed: int, number: int = 0) -> Recording:
     """A robot moves, from rest.
 
     Args:
         robot: The robot.
         secret: What is wrong with it.
         seed: Of its way and its noise.
+        number: Of the recording.
     """
+    push = secret.push if secret.push and secret.push.recording == number else None
     hard = bool(secret.dry or secret.fade or not secret.turns)
     stiff = secret.rotor is not None and secret.rotor[4] > 0
     row = 1 / robot.rate
@@ -260,6 +299,8 @@ def record(robot: Robot, secret: Secret, seed: int) -> Recording:
                     dof = model.joint(name).dofadr[0]
                     faded = np.exp(-((data.qvel[dof] / rate) ** 2))
                     model.dof_frictionloss[dof] = dry[dof] + more * faded
+                if push:
+                    push.act(data)
                 mujoco.mj_step(model, data)
         fine[-1] = data.qpos[place]
     finally:
@@ -490,6 +531,26 @@ def play(robot, joint, random):
     return Secret(rotor=(joint, turning, stiffness, damping, gap)), values
 
 
+def push(robot, link, random):
+    model = compiled(robot, Secret(), ENGINE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    near = TIPS[robot.name] if link == robot.tip else model.body(link).ipos
+    point = near + random.uniform(-0.02, 0.02, 3)
+    body, jacobian = data.body(link), np.zeros((3, model.nv))
+    place = body.xpos + body.xmat.reshape(3, 3) @ point
+    mujoco.mj_jac(model, data, jacobian, None, place, body.id)
+    direction = random.standard_normal(3)
+    torque = (jacobian.T @ direction)[[model.joint(j).dofadr[0] for j in robot.joints]]
+    # A multiple of the torque that a joint has anyway, where it is largest by that measure.
+    most = np.max(np.abs(torque) / usual(robot.name).torque)
+    force = direction * random.uniform(1.0, 2.5) / most
+    middle, width = random.uniform(0.3, 0.7) * robot.seconds, random.uniform(0.08, 0.2)
+    number = int(random.integers(robot.records))
+    secret = Push(link, tuple(point), tuple(force), float(middle), float(width), number)
+    return Secret(push=secret), {'instant': secret.middle, 'recording': number}
+
+
 # Effect of the library -> what is wrong. Of friction the file has none at that joint.
 EFFECTS: dict[str, Wrong] = {
     'viscous_friction': viscous,
@@ -508,6 +569,7 @@ EFFECTS: dict[str, Wrong] = {
     'ground_slope': slope,
     'joint_flexibility': flexible,
     'backlash': play,
+    'external_push': push,
 }
 CARRIED = {'arm2': 1.58, 'leg3': 0.4, 'cartpole': 0.236, 'furuta': 0.121, 'arm6': 1.4}  # kg
 TIPS = {
@@ -533,6 +595,8 @@ def sites(robot: Robot, effect: str) -> tuple[str, ...]:
         return ('all',)
     if effect == 'payload':
         return (robot.tip,)
+    if effect == 'external_push':
+        return (*robot.links[:-1], robot.tip)
     if effect == 'rotor_inertia':
         return tuple(j for j in robot.driven if j != first)
     if effect == 'encoder_offset':

@@ -34,24 +34,39 @@ def uncertainty(
         return np.zeros((k, k)), np.zeros(k), _unknown(problem)
     excess = max(1.0, point.sse.sum() / point.count.sum())
     rescale = 1 / (excess * weight)
-    if not k:
-        none = np.zeros((0, 0))
-        return none, np.zeros(0), _own_sigmas(problem, point, none, rescale)
+    if not k and not any(map(len, _unknown(problem))):
+        return np.zeros((0, 0)), np.zeros(0), _unknown(problem)
+    sums = [rescale * rows for rows in _block_scores(problem, theta, motions, horizon, weight)]
+    covariance, information = np.zeros((0, 0)), np.zeros(0)
+    if k:
+        covariance, information = _of_shared(problem, point, sums, rescale)
+    return covariance, information, _own_sigmas(problem, point, sums, covariance, rescale)
+
+
+def _of_shared(
+    problem: Problem, point: Point, sums: list[np.ndarray], rescale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the shared unknowns and the share of each that comes from data."""
     belief = np.array(
         [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in problem.unknowns]
     )
     h, _, _ = reduced(point, 0.0)
     h = (h - np.diag(belief)) * rescale + np.diag(belief)
     inverse, lost = _inverse(h)
-    scores = _block_scores(problem, theta, motions, horizon, point, weight) * rescale
+    scores = np.vstack(_of_shared_alone(problem, point, sums))
     sandwich = inverse @ (scores.T @ scores + np.diag(belief)) @ inverse
-    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
+    ratio = _widening(sandwich, inverse)
     covariance = inverse * np.outer(ratio, ratio)
     covariance[lost, lost] = np.inf
     certain = np.where(belief > 0, np.diag(covariance), 0.0)
     information = 1 - np.clip(certain * belief, 0, 1)
     information[lost] = 0.0
-    return covariance, information, _own_sigmas(problem, point, covariance, rescale)
+    return covariance, information
+
+
+def _widening(sandwich: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Standard deviations by the sandwich over those by curvature, where they are larger."""
+    return np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
 
 
 def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
@@ -64,7 +79,11 @@ def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarra
 
 
 def _own_sigmas(
-    problem: Problem, point: Point, covariance: np.ndarray, rescale: float
+    problem: Problem,
+    point: Point,
+    sums: list[np.ndarray],
+    covariance: np.ndarray,
+    rescale: float,
 ) -> tuple[np.ndarray, ...]:
     """Standard deviation of each data set's own values, what is shared being uncertain too."""
     found = list(_unknown(problem))
@@ -72,8 +91,14 @@ def _own_sigmas(
         return tuple(found)
     shared = np.where(np.isfinite(covariance), covariance, 0.0)
     for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
+        inverse = solve(own, np.eye(len(own))) / rescale
+        scatter = np.zeros_like(inverse)
+        for i, place in zip(block.data_sets, block.places, strict=True):
+            scores = sums[i][:, : len(place)]
+            scatter[np.ix_(place, place)] += scores.T @ scores
+        ratio = _widening(inverse @ scatter @ inverse, inverse)
         moved = solve(own, cross)
-        spread = solve(own, np.eye(len(own))) / rescale + moved @ shared @ moved.T
+        spread = inverse * np.outer(ratio, ratio) + moved @ shared @ moved.T
         sigmas = np.sqrt(np.maximum(np.diag(spread), 0.0))
         for i, place in zip(block.data_sets, block.places, strict=True):
             found[i] = sigmas[place][len(problem.data_sets[i].motion) :]
@@ -99,23 +124,30 @@ def _inverse(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return inverse / np.outer(scale, scale), lost
 
 
-def _block_scores(
-    problem: Problem,
-    theta: np.ndarray,
-    motions: list[np.ndarray],
-    horizon: float,
-    point: Point,
-    weight: float,
-) -> np.ndarray:
-    """Gradient of the cost by the shared unknowns, block by block of time, shape (blocks, k)."""
-    values = problem.values(theta)
-    chain = problem.chain(values)
-    blocks = []
+def _of_shared_alone(problem: Problem, point: Point, sums: list[np.ndarray]) -> list[np.ndarray]:
+    """Scores of the shared unknowns, with all else where it is best for them."""
     # What moves of each data set's own with what is shared, shape (own, k).
     follows: dict[int, np.ndarray] = {}
     for block, (own, cross, _) in zip(problem.blocks, point.own, strict=True):
         solved = solve(own, cross)
         follows |= {i: solved[p] for i, p in zip(block.data_sets, block.places, strict=True)}
+    return [
+        rows[:, len(follows[i]) :] - rows[:, : len(follows[i])] @ follows[i]
+        for i, rows in enumerate(sums)
+    ]
+
+
+def _block_scores(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    weight: float,
+) -> list[np.ndarray]:
+    """Gradient of each data set's cost, block by block of time: its own, then what is shared."""
+    values = problem.values(theta)
+    chain = problem.chain(values)
+    found = []
     for i, data_set in enumerate(problem.data_sets):
         n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
         assert y is not None
@@ -124,6 +156,6 @@ def _block_scores(
         rows = np.einsum('kj,kjc->kc', residual, jacobian)
         edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(data_set.time[n - 1], 1e-9))))
         sums = np.add.reduceat(rows, edges, axis=0)
-        m2 = len(motions[i])
-        blocks.append(sums[:, m2:] * chain - sums[:, :m2] @ follows[i])
-    return np.vstack(blocks)
+        sums[:, len(motions[i]) :] *= chain
+        found.append(sums)
+    return found

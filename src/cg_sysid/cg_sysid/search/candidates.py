@@ -307,12 +307,7 @@ def cost_of(task: Task) -> int:
     effect = _tried(task)
     assert effect is not None
     swept = any(p.swept for p in effect.parameters)
-    return (
-        100 * eventful(task)
-        + 10 * bool(effect.states)
-        + 10 * swept
-        + len(starts_of(effect))
-    )
+    return 100 * eventful(task) + 10 * bool(effect.states) + 10 * swept + len(starts_of(effect))
 
 
 def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
@@ -757,9 +752,15 @@ def prior_conflicts(o: Outcome) -> dict[str, float]:
     }
 
 
+def _declared_by(o: Outcome) -> tuple[Parameter, ...]:
+    """Parameters of the effect that an outcome is of; none where it is of a model alone."""
+    found = (e.parameters for e in o.model.effects if e.label == o.label and e.name in LIBRARY)
+    return next(found, ())
+
+
 def too_small(o: Outcome) -> list[str]:
     """An effect whose size is as good as none is not what helped."""
-    first = next(iter(_declared(o.task)), None)
+    first = next(iter(_declared_by(o)), None)
     if first is None or first.neutral is None or not np.isfinite(first.neutral) or first.each:
         return []
     value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
@@ -775,7 +776,7 @@ def undetermined_size(o: Outcome) -> list[str]:
 
     A limit that was never reached, a stiffness that nothing bends: what acts is something else.
     """
-    name = next((p.name for p in _declared(o.task)), '')
+    name = next((p.name for p in _declared_by(o)), '')
     if f'{o.label}.{name}' not in o.train.undetermined:
         return []
     return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
@@ -802,7 +803,7 @@ def at_edge(o: Outcome) -> list[str]:
     physics ends with the range.
     """
     found = []
-    declared = _declared(o.task)
+    declared = _declared_by(o)
     optional = {f'{o.label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
     ends = {f'{o.label}.{p.name}': p.ends for p in declared}
     for u, v in zip(o.train.unknowns, o.train.values, strict=True):

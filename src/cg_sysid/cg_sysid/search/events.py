@@ -166,7 +166,7 @@ class _Seeking:
 
     def _fit(self, data_set: DataSet, event: np.ndarray, iterations: int) -> Fit:
         own = {data_set.name: self.beside(data_set, event)}
-        return fit(self.model, [data_set], only=(), own=own, iterations=iterations)
+        return fit(self.model, [data_set], only=(), own=own, iterations=iterations, sure=False)
 
 
 def _small_events(

@@ -85,7 +85,8 @@ class Scores:
         unseen = {
             (name, at)
             for name, at in candidates
-            if (name, at) not in self.gains and not _happens(name)
+            if (name, at) not in self.gains
+            and not _happens(name)
             and (at is None or _joint(at) in self.worst[:WORST])
         }
         return [c for c in candidates if c in seen or c in unseen or c in self.pushed]
