@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip('mujoco', reason='MuJoCo is not installed')
+pytest.importorskip('mujoco', reason='MuJoCo is not installed')
 
+import mujoco
 from hanging_arm import nominal, urdf
 from mujoco_tree import SAMPLE, Secret, compiled, record, wander
 
