@@ -20,7 +20,7 @@ D; it is looked at on the joints of which the torques are worst explained. A rob
 has 150 candidates, and a fit of one takes seconds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -48,6 +48,7 @@ WORST = 2  # joints on which effects with states are looked at
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
 BLOCK = 12  # rows, 0.5 s
 QUIET = 0.9  # share of the blocks at least in which nobody pushes
+SLOW = 0.1  # of the usual rate of a joint
 STANDS_OUT = 4.0  # ratio of what a push gains to what any of these blocks does
 
 
@@ -156,9 +157,11 @@ def scores(
     noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = model.mechanism.kinematics(train[0].setup).names
+    rates = np.vstack([problem.motion.rate for problem in problems])
     error = left[: residual.size].reshape(residual.shape)
-    pushes = {c: _push(model, c, error, free) for c in candidates if _happens(c[0])}
-    return Scores(gains, by_fit, tuple(free[k] for k in order), _nearest(pushes))
+    pushers = [c for c in candidates if _happens(c[0])]
+    pushed = _pushed(model, pushers, error, _turning(rates), free)
+    return Scores(gains, by_fit, tuple(free[k] for k in order), pushed)
 
 
 def _happens(name: str) -> bool:
@@ -166,42 +169,72 @@ def _happens(name: str) -> bool:
     return any(p.each == 'record' for p in LIBRARY[name].parameters)
 
 
-def _push(
-    model: Model, candidate: tuple[str, str | None], error: np.ndarray, free: Sequence[str]
-) -> np.ndarray:
-    """Nats that a push on a link gains, the largest of each block of the rows.
+def _turning(rates: np.ndarray) -> np.ndarray:
+    """Where a joint turns around, or nearly rests: there torques are off by friction's shape."""
+    size = np.maximum(np.sqrt(np.mean(rates**2, axis=0)), 1e-300)
+    slow = np.abs(rates) < SLOW * size
+    slow[1:] |= rates[1:] * rates[:-1] < 0
+    slow[:-1] |= slow[1:]
+    slow[1:] |= slow[:-1]
+    return slow
+
+
+def _pushed(
+    model: Model,
+    candidates: Sequence[tuple[str, str | None]],
+    error: np.ndarray,
+    turning: np.ndarray,
+    free: Sequence[str],
+) -> tuple[tuple[str, str | None], ...]:
+    """The pushes that are worth a fit, if any.
+
+    Most blocks of rows are without one. What stands out of them as much as it does elsewhere is an
+    error of the model. That a push stands out is told by joints that do not turn around just then;
+    which link has it, by all: of those that gain as much, the one nearest to the base.
 
     Args:
         model: The base.
-        candidate: (effect, place).
+        candidates: Pushes, (effect, place).
         error: Of the torques, in standard deviations, (rows, m).
+        turning: Where a joint turns around, (rows, m).
         free: Names of the m coordinates.
     """
+    about = {c: _about(model, c, free) for c in candidates}
+    clear, every = (
+        {c: _gains(rows[:, joints]) for c, joints in about.items()}
+        for rows in (np.where(turning, 0.0, error), error)
+    )
+    found = []
+    for gains in clear.values():
+        block = int(np.argmax(gains))
+        if gains[block] > max(SEEN, STANDS_OUT * np.quantile(gains, QUIET)):
+            found.append((float(gains[block]), block))
+    if not found:
+        return ()
+    _, block = max(found)
+    nearest = []
+    for gained in (clear, every):
+        there = {c: float(gains[block]) for c, gains in gained.items()}
+        near = [c for c in candidates if there[c] > max(there.values()) - SEEN]
+        nearest.append(min(near, key=lambda c: len(about[c])))
+    return tuple(dict.fromkeys(nearest))
+
+
+def _about(model: Model, candidate: tuple[str, str | None], free: Sequence[str]) -> list[int]:
+    """Of the coordinates of these names, those that a push acts about."""
     effect = LIBRARY[candidate[0]](model.mechanism, candidate[1])
     acting = {p.name for p in effect.parameters if p.neutral is not None}
-    about = [k for k, joint in enumerate(free) if f'impulse_{joint}' in acting]
-    total = np.cumsum(np.vstack([np.zeros(error.shape[1]), error]), axis=0)[:, about]
+    return [k for k, joint in enumerate(free) if f'impulse_{joint}' in acting]
+
+
+def _gains(error: np.ndarray) -> np.ndarray:
+    """Nats that a push gains by errors of torques, the largest of each block of the rows."""
+    total = np.cumsum(np.vstack([np.zeros(error.shape[1]), error]), axis=0)
     gains = np.zeros(BLOCK * -(-len(error) // BLOCK))
     for n in PULSES:
         own = ((total[n:] - total[:-n]) ** 2).sum(axis=1) / n / 2
         gains[: len(own)] = np.maximum(gains[: len(own)], own)
     return gains.reshape(-1, BLOCK).max(axis=1)
-
-
-def _nearest(
-    pushes: Mapping[tuple[str, str | None], np.ndarray],
-) -> tuple[tuple[str, str | None], ...]:
-    """The push that is worth a fit, if any: of those that gain as much, the nearest to the base.
-
-    Most blocks are without one. What stands out of them as it does elsewhere is an error of the
-    model: friction that turns within a window.
-    """
-    best = max((float(gains.max()) for gains in pushes.values()), default=0.0)
-    near = [
-        c for c, gains in pushes.items()
-        if gains.max() > max(SEEN, best - SEEN, STANDS_OUT * np.quantile(gains, QUIET))
-    ]  # fmt: skip
-    return tuple(sorted(near, key=lambda c: float(pushes[c].sum()))[:1])
 
 
 def _sensed(name: str) -> bool:
