@@ -29,7 +29,7 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
         )  # fmt: skip
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
-        said = scores(base.train.model, work.train, effects, bounds, work.carry_out)
+        said = scores(base.model, work.train, effects, bounds, work.carry_out)
         if said is not None:
             work.torques[key] = said
             effects = said.worth(effects)

@@ -31,6 +31,8 @@ ITERATIONS = 25
 SETTLED = 1e-4  # relative change of the cost
 DAMPING = 1e-3  # Levenberg-Marquardt, at first
 MOST_DAMPING = 1e6
+PATIENCE = 4  # steps that may gain little where a full one promises more
+STRAINED = 2.5  # tolerances that a value lies off its belief
 CAP = 4.0  # standard deviations from which a row counts less: rates that turn within a window
 
 
@@ -174,9 +176,31 @@ def fits_by_torque(
     if not problems:
         return []
     return [
-        _descend([problem.at(model) for problem in problems], own, scale, at or {})
+        _best([problem.at(model) for problem in problems], own, scale, at or {})
         for model, own in zip(plain, unknowns, strict=True)
     ]
+
+
+def _best(
+    problems: Sequence['Problem'],
+    unknowns: Sequence[Unknown],
+    scale: np.ndarray | None,
+    at: Mapping[str, float],
+) -> TorqueFit:
+    """From given values and, where these strain the belief, from what is believed as well.
+
+    What an effect more could take over from strained numbers lies far off, along a curved valley
+    of numbers that the torques cannot tell apart.
+    """
+    found = _descend(problems, unknowns, scale, at)
+    strained = any(
+        abs(u.to_coordinate(at[u.name]) - u.to_coordinate(u.prior)) > STRAINED * u.tolerance
+        for u in unknowns if u.name in at
+    )  # fmt: skip
+    if not strained:
+        return found
+    afresh = _descend(problems, unknowns, found.scale, {})
+    return min(found, afresh, key=lambda fitted: fitted.cost)
 
 
 def _descend(
@@ -195,13 +219,15 @@ def _descend(
     residual, jacobian = evaluated(problems, unknowns, theta)
     if scale is None:
         scale = spread_of(residual)
-    damping, cost = DAMPING, _cost(residual, scale, theta, prior, tolerance)
+    damping, patience = DAMPING, PATIENCE
+    cost = _cost(residual, scale, theta, prior, tolerance)
     for _ in range(ITERATIONS):
-        weight = 1 / np.maximum(1.0, np.abs(residual / scale) / CAP)
+        weight = 1 / beyond(residual / scale)
         r = (weight * residual / scale).ravel()
         j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
         h = j.T @ j + np.diag(1 / tolerance**2)
         g = j.T @ r + (theta - prior) / tolerance**2
+        promised = float(g @ np.linalg.lstsq(h, g, rcond=None)[0])
         better = False
         while not better and damping < MOST_DAMPING:
             step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-12), -g, rcond=None)[0]
@@ -214,7 +240,10 @@ def _descend(
             damping = damping / 5 if better else 5 * damping
         if not better:
             break
-        settled = cost - new_cost < SETTLED * cost
+        # Along what only the belief knows a damped step is short, and gains little.
+        little = cost - new_cost < SETTLED * cost
+        patience -= little
+        settled = little and (promised < SETTLED * cost or not patience)
         theta, residual, jacobian, cost = tried, new_residual, new_jacobian, new_cost
         if own_scale:
             scale = spread_of(residual)
@@ -320,6 +349,11 @@ def _range(u: Unknown) -> tuple[float, float]:
 def spread_of(residual: np.ndarray) -> np.ndarray:
     """Standard deviation of most of the rows, shape (m,)."""
     return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
+
+
+def beyond(error: np.ndarray) -> np.ndarray:
+    """By how much less rows count that are beyond CAP: of errors in standard deviations, >= 1."""
+    return np.maximum(1.0, np.abs(error) / CAP)
 
 
 def _cost(

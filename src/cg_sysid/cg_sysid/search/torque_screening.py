@@ -42,6 +42,7 @@ from cg_sysid.search.nuisance import Bounds
 FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
 FITTED = 16  # candidates that are fitted by torque, the best first
+STARTS = 4  # of each, from which they are fitted, the best first
 KEPT = 8  # of these, that are looked at
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
@@ -124,8 +125,9 @@ def scores(
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     tolerance = np.array([u.tolerance for u in unknowns])
     residual, jacobian = torque_error.evaluated(problems, unknowns, theta)
-    scale = torque_error.spread_of(residual)
-    known = (jacobian / scale[:, None]).reshape(residual.size, -1)
+    # Few rows are far off, where friction turns within a window: they count less, as in fits.
+    scale = torque_error.spread_of(residual) * torque_error.beyond(residual / fitted.scale)
+    known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
     # The belief is as good as measurements of the numbers themselves.
     belief = np.diag(1 / tolerance)
     orthonormal, _ = np.linalg.qr(np.vstack([known, belief[np.isfinite(tolerance)]]))
@@ -135,23 +137,27 @@ def scores(
     values = plain.with_values(fitted.values)
     problems = _as_predicted(plain, problems, residual)
     by_motion = [_by_motion(problem, values) for problem in problems]
-    gains = {}
+    gains: dict[tuple[str, str | None], float] = {}
+    promising: dict[tuple[str, str | None], list[int]] = {}
     for name, at in candidates:
         columns = _columns(values, name, at, problems, by_motion)
         if columns is None:
             continue
-        best = 0.0
+        of_starts = []
         for start in columns:
             d = np.zeros((len(left), start.shape[2]))
-            d[: residual.size] = (start / scale[:, None]).reshape(residual.size, -1)
+            d[: residual.size] = (start / scale[:, :, None]).reshape(residual.size, -1)
             d -= orthonormal @ (orthonormal.T @ d)
             solution, *_ = np.linalg.lstsq(d, -left, rcond=1e-9)
             rest = left + d @ solution
-            best = max(best, float(left @ left - rest @ rest) / 2)
-        gains[name, at] = best
+            of_starts.append(float(left @ left - rest @ rest) / 2)
+        gains[name, at] = max(0.0, *of_starts)
+        promising[name, at] = [int(k) for k in np.argsort(of_starts)[::-1][:STARTS]]
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
     gained = carry_out(
-        _gain_by_fit, [(plain, c, train, bounds, fitted) for c in follow], 'what torques say'
+        _gain_by_fit,
+        [(plain, c, promising[c], train, bounds, fitted) for c in follow],
+        'what torques say',
     )
     by_fit = dict(zip(follow, gained, strict=True))
     noise = _noise(train[0], by_motion)
@@ -245,20 +251,28 @@ def _sensed(name: str) -> bool:
 def _gain_by_fit(
     model: Model,
     candidate: tuple[str, str | None],
+    promising: Sequence[int],
     train: Sequence[DataSet],
     bounds: Bounds,
     base: TorqueFit,
 ) -> float:
-    """Nats that a candidate gains, fitted together with the numbers of the base."""
+    """Nats that a candidate gains, fitted together with the numbers of the base.
+
+    Args:
+        model: The base, without states.
+        candidate: (effect, place).
+        promising: Which of its starts are tried.
+        train: Prepared records.
+        bounds: Of small faults.
+        base: Its fit.
+    """
     name, at = candidate
     label = LIBRARY[name](model.mechanism, at).label
     small = any(effect.label == label for effect in model.effects)
     without = model.without_effect(label) if small else model
     own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
-    extended = [
-        without.with_effect(name, at, **start)
-        for start in starts_of(LIBRARY[name](model.mechanism, at))
-    ]
+    starts = starts_of(LIBRARY[name](model.mechanism, at))
+    extended = [without.with_effect(name, at, **starts[k]) for k in promising]
     found = torque_error.fits_by_torque(
         extended, train, None, own, scale=base.scale, at=base.values
     )
