@@ -138,3 +138,15 @@ def test_records_are_followed_as_far_as_the_torques_are_right(believed):
         for model in (believed, weak)
     ]
     assert 0 < cuts[0] < cuts[1]
+
+
+def test_what_strains_the_belief_is_fitted_afresh(believed):
+    """A load on the last link, whose own numbers take it over first, far from their belief."""
+    load = {'mass': 1.1, 'x': 0.01, 'y': 0.02, 'z': -0.2}
+    train = data(believed.with_values(OFF).with_effect('payload', 'shank', **load), believed)
+    alone = fit_by_torque(believed, train)
+    assert alone.values['shank_mass'] > 1.5
+    carrying = believed.with_effect('payload', 'shank', mass=0.5)
+    found = fit_by_torque(carrying, train, scale=alone.scale, at=alone.values)
+    assert found.values['payload@shank.mass'] == pytest.approx(load['mass'], rel=0.25)
+    assert (alone.cost - found.cost) / 2 > SEEN
