@@ -5,7 +5,8 @@ base and D that by the numbers of one candidate at its start,
 
     gain = (|P r|^2 - min_d |P (r + D d)|^2) / 2,    P: without what J and its belief explain
 
-in standard deviations of what the base leaves. D costs no fit and no compilation:
+in standard deviations of what the base leaves; rows far beyond them, where friction turns within a
+window, count less. D costs no fit and no compilation:
 
     a torque on a joint, a body    derivative of its generalised force along the measured motion
     a sensor                       of the motion that it would make of the measured one
