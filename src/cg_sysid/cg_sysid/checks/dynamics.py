@@ -15,7 +15,7 @@ from cg_dynamics.mechanisms import URDF
 from cg_sysid.checks.law import Law, Motion, fit_law, motion_of
 from cg_sysid.checks.signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.records.findings import Finding
-from cg_sysid.records.jumps import find_step
+from cg_sysid.records.jumps import Step, find_step
 from cg_sysid.records.raw import RawRecording
 from cg_sysid.records.record import NS_PER_S
 from cg_sysid.records.torque_gaps import over_gap
@@ -34,6 +34,9 @@ RATHER = 2.0  # a torque turns rather than an angle, which would jump: leaves at
 RATES = (2, 3, 4, 5, 10)  # ratios of sampling rates that are tried
 MOVED = 6.0  # standard errors of a term that makes a fault, [1]
 ANSWERED = 5.0  # standard errors of an answer to what a record does not show, [1]
+ELSEWHERE = np.linspace(0.1, 0.9, 9)  # of a recording, where such an answer is asked for as well
+USUALLY = 0.75  # share of these places at which the law is off by no more
+OFF_ELSEWHERE = 3.0  # answer to a step over that there
 LIKE = 0.35  # such a term agrees with the fault to within this share, [1]
 SHORT = 2.5  # samples by which a topic ends before the others
 BEYOND = 'beyond_torque'  # name of what a limit may hide
@@ -233,6 +236,21 @@ def _spread_out(
     return _left(slower, torque, angle, since)
 
 
+def _only_then(motion: Motion, torque: Signal, angle: str, step: Step, missing: float) -> bool:
+    """Whether no such term is missing from other instants on, as it is where the law is off.
+
+    A sensor that is late shows a law that holds nowhere exactly.
+    """
+    after = (motion.time > step.time).astype(float)
+    others = []
+    for at in np.quantile(motion.time, ELSEWHERE):
+        rows = motion.away_from(step.time) & motion.away_from(at)
+        later = (motion.time > at).astype(float)
+        beside = fit_law(motion, torque.channel, angle, (after, later), rows)
+        others.append(abs(float(beside.extra[1])))
+    return abs(missing) > OFF_ELSEWHERE * float(np.quantile(others, USUALLY))
+
+
 def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Finding]:
     """A step of the torque that the joint does not answer; friction may hold one that rests."""
     angle = joint.channel
@@ -247,7 +265,7 @@ def _unanswered(torque: Signal, joint: Signal, motion: Motion) -> Iterator[Findi
     missing, error = -float(law.extra[0]), float(law.extra_error[0])
     expected = law.factor * step.size
     alike = abs(missing - expected) < LIKE * abs(expected) + 3 * error
-    if abs(missing) > MOVED * error and alike:
+    if abs(missing) > MOVED * error and alike and _only_then(motion, torque, angle, step, missing):
         held = rests(joint, step.time - RESTING_S, step.time + RESTING_S)
         yield Finding(
             'zero_shift',
