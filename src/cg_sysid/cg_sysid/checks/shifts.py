@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from cg_dynamics.mechanisms import URDF
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_sysid.checks.resting import resting_band
@@ -45,7 +46,9 @@ def check_steps(
         for name in (*known.input_names, *known.output_names)
         if name in signals and np.ptp(signals[name].values) > 0.0
     }
-    knocks = raw.mechanism.name == CompassGait.name and raw.setup.may_step
+    # A foot that lands knocks, and so do teeth of a robot's joint whose play is passed.
+    steps = raw.mechanism.name == CompassGait.name and raw.setup.may_step
+    knocks = steps or raw.mechanism.name == URDF
     for name, signal in clean.items():
         if not signal.is_position:
             continue  # a torque may jump, and a rate at a knock
