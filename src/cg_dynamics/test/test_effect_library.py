@@ -309,25 +309,6 @@ def test_push_gives_its_impulse_to_the_robot(bare):
     np.testing.assert_allclose(after - before, impulse * bare.values['leg_length'], rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ('tails', 'law', 'within'),
-    [
-        (0.0, np.tanh, 1e-12),
-        (1 / 3, lambda x: x / np.hypot(x, 1), 1e-12),
-        # Slope and tail are those of the arctan, in between it is off by 2.5 % of the level.
-        (1.0, lambda x: 2 / np.pi * np.arctan(np.pi * x / 2), 0.025),
-    ],
-)
-def test_dry_friction_turns_as_others_let_it_turn(bare, tails, law, within):
-    turns, level = 0.02, 0.7
-    effect = next(e for e in bare.with_effect('coulomb_friction').effects
-                  if e.name == 'coulomb_friction')  # fmt: skip
-    p = {'torque': level, 'transition_rate': turns, 'tails': tails}
-    for rate in np.concatenate([-np.geomspace(1e-4, 3, 40), np.geomspace(1e-4, 3, 40)]):
-        torque, _ = effect.joint_torque(ca.DM(0), ca.DM(rate), ca.DM(0), [], p)
-        assert float(torque) == pytest.approx(-level * law(rate / turns), abs=within * level)
-
-
 # --- the torque path ----------------------------------------------------------------------
 
 
