@@ -165,7 +165,7 @@ def scores(
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = model.mechanism.kinematics(train[0].setup).names
     rates = np.vstack([problem.motion.rate for problem in problems])
-    error = left[: residual.size].reshape(residual.shape)
+    error = residual / torque_error.spread_of(residual)  # a push is far off, and counts in full
     pushers = [c for c in candidates if _happens(c[0])]
     pushed = _pushed(model, pushers, error, _turning(rates), free)
     return Scores(gains, by_fit, tuple(free[k] for k in order), pushed)
