@@ -193,7 +193,12 @@ class Plant:
             return
         before = self._x.copy()
         self._compiled.advance(self._x, u, self._p, step, steps)
-        if not self._walks or not self._height(before) > 0 >= self._height(self._x):
+        if not self._walks:
+            return
+        (reach, height), (reach_then, height_then) = self._foot(before), self._foot(self._x)
+        # Legs that balance side by side pass each other all the time: none of that is a landing,
+        # and to locate it would cost twenty times the step itself.
+        if not height > 0 >= height_then or max(reach, reach_then) <= self._minimum_step:
             return
         duration = step * steps
 
@@ -202,10 +207,9 @@ class Plant:
             self._compiled.advance(x, u, self._p, part / steps, steps)
             return x
 
-        instant = self._root(lambda part: self._height(after(part)), 0.0, duration, xtol=INSTANT)
+        instant = self._root(lambda part: self._foot(after(part))[1], 0.0, duration, xtol=INSTANT)
         x = after(instant)
-        reach, _ = swing_foot(x, self.stance, self.model.values['leg_length'])
-        if reach <= self._minimum_step:
+        if self._foot(x)[0] <= self._minimum_step:
             return
         landed = impact(self.model, self.stance, x)
         self._x = landed.x_plus
@@ -217,8 +221,9 @@ class Plant:
         self._compiled = compile_model(self.model, replace(self.setup, stance=stance))
         self._jolt = None
 
-    def _height(self, x: np.ndarray) -> float:
-        return swing_foot(x, self.stance, self.model.values['leg_length'])[1]
+    def _foot(self, x: np.ndarray) -> tuple[float, float]:
+        # How far ahead the swing foot is and how high above the ground, m.
+        return swing_foot(x, self.stance, self.model.values['leg_length'])
 
     def push(self, impulse: float) -> None:
         """Somebody hits the hip of a compass gait: the rates jump by M^-1 J' P at once.

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy
 
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -86,6 +87,20 @@ def test_steps_shorter_than_the_least_do_not_land(bare):
     for _ in range(200):
         machine.advance()
     assert machine.stance == 'inner'
+
+
+def test_no_landing_is_looked_for_where_legs_pass_each_other(bare, monkeypatch):
+    def located(*args, **kwargs):
+        raise AssertionError('looked for')
+
+    monkeypatch.setattr(scipy.optimize, 'brentq', located)
+    machine = Plant(bare, Setup(on_blocks=False), np.array([0.02, -0.08, 0.0, 1.0]))
+    heights = []
+    for _ in range(50):
+        machine.advance()
+        inner, outer = machine.state[:2]
+        heights.append(np.cos(inner) - np.cos(outer))
+    assert heights[0] > 0.0 > min(heights)
 
 
 def test_a_body_that_is_put_somewhere_rests_there_and_is_measured_there():
