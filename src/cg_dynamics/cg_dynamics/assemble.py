@@ -160,6 +160,8 @@ def assemble(model: Model, setup: Setup) -> Equations:
         joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
         angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
         load, share = driving.get(joint, ca.SX(0)), ca.SX(0)
+        for e in here:
+            load = e.command(load, angle, rate, own[e.label])
         for hook in ('deliver', 'transmit', 'joint_torque'):
             added = 0
             for e in here:

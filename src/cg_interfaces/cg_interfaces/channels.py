@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cg_dynamics.mechanisms import Mechanism as Body
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
+TRAJECTORY_STATE = 'control_msgs/msg/JointTrajectoryControllerState'
 IMU = 'sensor_msgs/msg/Imu'
 STRING = 'std_msgs/msg/String'
 
@@ -71,6 +72,9 @@ class Topic:
 class Mechanism:
     """The topics of one mechanism, inputs apart from outputs.
 
+    `told` is what drives are told that follow positions: their efforts are torques beyond that.
+    It counts only in recordings that say so.
+
     The torque command carries the same channels as the applied torque. It is the input only
     where there is no applied torque, or on request. Where there is neither, the effort of the
     joints on /joint_states is.
@@ -81,6 +85,7 @@ class Mechanism:
     command: Topic
     extra_inputs: tuple[Topic, ...]
     outputs: tuple[Topic, ...]
+    told: Topic | None = None
 
     @property
     def topics(self) -> dict[str, Topic]:
@@ -118,6 +123,12 @@ class Mechanism:
         return tuple(c.name for topic in self.extra_inputs for c in topic.channels)
 
     @property
+    def told_names(self) -> tuple[str, ...]:
+        """Names of the positions and rates that drives may be told."""
+        told = self.told.channels if self.told else ()
+        return tuple(c.name for c in told if c.name not in self.input_names)
+
+    @property
     def output_names(self) -> tuple[str, ...]:
         """Names of the measured channels, in model order."""
         return tuple(c.name for topic in self.outputs for c in topic.channels)
@@ -135,7 +146,7 @@ class Mechanism:
         Raises:
             ValueError: This mechanism has no such channel.
         """
-        for topic in self.topics.values():
+        for topic in (*self.topics.values(), *([self.told] if self.told else [])):
             for channel in topic.channels:
                 if channel.name == name:
                     return channel
@@ -268,7 +279,22 @@ def _of_joints(body: 'Body') -> Mechanism:
         *_torque_topics(frame, torques),
         (_drive_enabled(frame),),
         (Topic(topics.JOINT_STATES, JOINT_STATE, frame, tuple(measured)),),
+        _told(body, frame, torques),
     )
+
+
+def _told(body: 'Body', frame: str, torques: tuple[Channel, ...]) -> Topic | None:
+    """What drives that follow positions are told: where to be, how fast, and a torque more."""
+    channels = []
+    for torque in torques:
+        unit = 'm' if body.slides(torque.joint) else 'rad'
+        for name, field in zip(body.told(torque.joint), ('position', 'velocity'), strict=False):
+            channels.append(
+                Channel(name, unit if field == 'position' else f'{unit}/s', field, torque.joint)
+            )
+    if not channels:
+        return None
+    return Topic(topics.JOINT_COMMANDS, JOINT_STATE, frame, (*channels, *torques))
 
 
 def pitch_from_quaternion(x: float, y: float, z: float, w: float) -> float:
@@ -329,9 +355,30 @@ def _extract_imu(message: Any, topic: Topic) -> dict[str, float]:
     return values
 
 
+# Field of a JointState -> what it is called in a point of a trajectory.
+POINT_FIELDS = {'position': 'positions', 'velocity': 'velocities', 'effort': 'effort'}
+
+
+def _extract_trajectory_state(message: Any, topic: Topic) -> dict[str, float]:
+    """What a controller of trajectories told its joints at that instant."""
+    names = list(message.joint_names)
+    values = {}
+    for channel in topic.channels:
+        told = getattr(message.reference, POINT_FIELDS[channel.field])
+        if channel.joint not in names or len(told) == 0:
+            continue
+        index = names.index(channel.joint)
+        if index >= len(told):
+            msg = f'reference holds {len(told)} values for {len(names)} joint names'
+            raise ValueError(msg)
+        values[channel.name] = float(told[index])
+    return values
+
+
 EXTRACTORS: dict[str, Callable[[Any, Topic], dict[str, float]]] = {
     JOINT_STATE: _extract_joint_state,
     IMU: _extract_imu,
+    TRAJECTORY_STATE: _extract_trajectory_state,
 }
 
 

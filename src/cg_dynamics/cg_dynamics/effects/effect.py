@@ -4,7 +4,7 @@ An effect overrides the hooks of the places where it acts and leaves the others 
 receives what flows through that place and returns what leaves it. The order along the torque
 path is the order of the hooks below, so any effects compose:
 
-    input --input_delay--> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
+    input --input_delay--> command --> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
     Q and M also take energies, force, foot and up;   outputs: read, then output_delay
     where a foot lands: landing
 
@@ -257,6 +257,10 @@ class Effect:
     def input_delay(self, p: Symbols) -> ca.SX | None:
         """Time in s by which the inputs act late."""
         return None
+
+    def command(self, torque: ca.SX, angle: ca.SX, rate: ca.SX, p: Symbols) -> ca.SX:
+        """Torque that a drive asks of its motor, from what it is told and reads of its joint."""
+        return torque
 
     def deliver(self, torque: ca.SX, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
         """Torque of the motor in N m, from the torque that the drive reports."""

@@ -89,6 +89,10 @@ class Mechanism(ABC):
         """Unit of each input: N m on a joint that turns, N on one that slides."""
         return tuple('N' if self.slides(joint) else 'N m' for joint in self.joints)
 
+    def told(self, joint: str) -> tuple[str, ...]:
+        """Channels of the position and the rate that a drive may be told; empty if none may."""
+        return ()
+
     def output_unit(self, channel: str) -> str:
         """Unit of an output channel."""
         return self.output_units[self.outputs.index(channel)]

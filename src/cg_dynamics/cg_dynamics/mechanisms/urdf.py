@@ -107,6 +107,10 @@ class Urdf(Mechanism):
         )
         self.parameters = self._determined()
 
+    def told(self, joint: str) -> tuple[str, ...]:
+        """What a drive is told that follows positions."""
+        return f'{joint}_commanded_position', f'{joint}_commanded_velocity'
+
     # Models, sensors and compiled code of equal robots are the same.
     @cached_property
     def identity(self) -> str:

@@ -66,7 +66,7 @@ def _topics(raw: RawRecording) -> Iterator[Finding]:
     """Topics that should be there."""
     known = raw.mechanism
     tied = raw.setup.fixture == 'legs_tied'
-    if APPLIED_TORQUE not in raw.topics and not tied:
+    if APPLIED_TORQUE not in raw.topics and not tied and not raw.told:
         if raw.torque_topic == TORQUE_COMMAND:
             yield Finding(
                 'topic_missing',
@@ -89,6 +89,9 @@ def _topics(raw: RawRecording) -> Iterator[Finding]:
                 APPLIED_TORQUE,
                 f'missing, and there is no {TORQUE_COMMAND} either{effort}',
             )
+    if raw.told and raw.told not in raw.topics:
+        yield Finding('topic_missing', 'error', raw.told, 'missing; the note says that drives '
+                      'were told positions on it')  # fmt: skip
     present = [topic for topic in known.outputs if topic.name in raw.topics]
     for topic in known.outputs:
         if topic not in present:

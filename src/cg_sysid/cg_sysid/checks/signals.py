@@ -92,7 +92,7 @@ def read_signals(raw: RawRecording) -> dict[str, Signal]:
     known = raw.mechanism
     signals = {}
     for topic in raw.topics.values():
-        if topic.name == known.command.name:
+        if topic.name in (known.command.name, raw.told):
             continue
         for channel, values in topic.values.items():
             usable = np.flatnonzero(np.isfinite(values))

@@ -50,7 +50,7 @@ def check_timing(raw: RawRecording) -> Iterator[Finding]:
             continue
         asked = topic.name == TORQUE_COMMAND and APPLIED_TORQUE in raw.topics
         yield from _order(topic, origin, asked)
-        if topic.name in (EXPERIMENT, TORQUE_COMMAND, *switches):
+        if topic.name in (EXPERIMENT, TORQUE_COMMAND, raw.told, *switches):
             continue
         yield from _arrivals(raw, topic, origin)
         yield from _gaps(raw, topic, origin)

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects.effect import SESSION_TIME, TIME
+from cg_dynamics.effects.position_control import PositionControl
 from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -111,7 +112,8 @@ def require_same_robot(model: Model, records: Sequence[Record]) -> None:
         ValueError: One is of another robot.
     """
     for record in records:
-        if reason := other_robot(record.mechanism, model):
+        reason = other_robot(record.mechanism, model) or _other_drives(record, model)
+        if reason:
             raise ValueError(f'{recording_of(record)}: {reason}')
 
 
@@ -131,6 +133,24 @@ def other_robot(recorded: channels.Mechanism, model: Model) -> str:
         return ''
     apart = ', '.join(sorted(f'{c.name} ({c.place}, {c.unit})' for c in theirs ^ ours))
     return f'its channels and those of the model {model.name!r} differ: only one has {apart}'
+
+
+def _other_drives(record: Record, model: Model) -> str:
+    """Why what drives were told does not fit those of a model; empty if it does."""
+    joints = [e.site for e in model.effects if isinstance(e, PositionControl)]
+    if not joints and not set(record.inputs) & set(record.mechanism.told_names):
+        return ''
+    if not set(record.inputs) & set(record.mechanism.told_names):
+        return (
+            f'the model {model.name!r} has position_control at {", ".join(joints)}, but no '
+            'commanded positions were read: `position_control` in the note names their topic'
+        )
+    if missing := [joint for joint in model.mechanism.joints if joint not in joints]:
+        return (
+            f'its drives were told positions, but the model {model.name!r} has no '
+            f'position_control at {", ".join(missing)}'
+        )
+    return ''
 
 
 def recording_of(record: Record) -> str:

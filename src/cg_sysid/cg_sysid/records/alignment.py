@@ -79,10 +79,12 @@ def _cleaned_inputs(
         msg = f'torque_topic is {torque_topic!r}; allowed: {APPLIED_TORQUE}, {TORQUE_COMMAND}'
         raise ValueError(msg)
     chosen = torque_topic or raw.torque_topic
-    inputs = {}
+    inputs = _told(raw) if raw.told else {}
     for topic in mechanism.extra_inputs:
         if topic.name in raw.topics:
             inputs.update(_clean(raw, topic.name, mechanism.extra_input_names))
+    if raw.told:
+        return inputs
     if chosen in raw.topics:
         torques = _clean(raw, chosen, mechanism.input_names)
         missing = [name for name in mechanism.input_names if name not in torques]
@@ -101,6 +103,25 @@ def _cleaned_inputs(
         f'the bag has {", ".join([*raw.topics, *raw.others]) or "none"}'
     )
     raise RecordingError(msg)
+
+
+def _told(raw: RawRecording) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What drives were told that follow positions; rates and torques are 0 where none were."""
+    known, told = raw.mechanism, raw.told
+    if told not in raw.topics:
+        has = ', '.join([*raw.topics, *raw.others]) or 'none'
+        msg = f'{raw.path}: topic missing: position_control in the note names {told}; '
+        raise RecordingError(f'{msg}the bag has {has}')
+    found = _clean(raw, told, (*known.told_names, *known.input_names))
+    for name in (*known.told_names, *known.input_names):
+        if name in found:
+            continue
+        channel = known.channel(name)
+        if channel.field == 'position':
+            raise RecordingError(f'{raw.path}: topic {told} holds no {channel.place}')
+        stamps = raw.topics[told].stamp_ns
+        found[name] = np.sort(stamps)[:1], np.zeros(1)
+    return found
 
 
 def _clean(

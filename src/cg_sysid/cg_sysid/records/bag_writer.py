@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,10 @@ def _write(path: Path, record: Record, commands: dict[str, Any]) -> None:
     series = [
         (topic, signals) for topic in mechanism.topics.values() if topic.name != TORQUE_COMMAND
     ]
+    if told := record.note.get('position_control'):
+        assert mechanism.told is not None
+        series = [s for s in series if s[0].name != mechanism.torque.name]
+        series.append((replace(mechanism.told, name=told), signals))
     if commands:
         series.append((mechanism.command, commands))
     first = int(record.stamp_ns[0])

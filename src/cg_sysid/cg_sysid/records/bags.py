@@ -5,7 +5,7 @@ Reading goes in two steps. `read_raw` takes every sample as it stands in the fil
 axis. `read_bag` does both; `write_bag` goes the other way.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from math import isnan
 from pathlib import Path
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from cg_description.reading import parse_yaml, path_of, read_text
 from cg_description.schema import Mapping as Form
 from cg_interfaces import channels
-from cg_interfaces.channels import STRING, Topic
+from cg_interfaces.channels import STRING, TRAJECTORY_STATE, Topic
 from cg_interfaces.topics import EXPERIMENT, JOINT_STATES
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.alignment import to_record
@@ -111,9 +111,8 @@ def _read_open(
         raise RecordingError(f'{path}: empty; the bag holds no message')
     merged_note = {**_read_note(path, reader), **(note or {})}
     mechanism = _mechanism_of(path, merged_note, of_model)
-    recorded = {c.topic for c in reader.connections}
-    has_torque = recorded & {mechanism.torque.name, mechanism.command.name}
-    topics = mechanism.topics if has_torque else mechanism.topics_with_effort
+    topics = _topics_in(path, {c.topic: c.msgtype for c in reader.connections}, merged_note,
+                        mechanism)  # fmt: skip
     gains = _effort_gains(path, merged_note, mechanism)
     used = [c for c in reader.connections if c.topic in topics]
     for connection in used:
@@ -137,6 +136,7 @@ def _read_open(
             values = {name: gains.get(name, 1.0) * value for name, value in values.items()}
         stamp = message.header.stamp
         rows.append((stamp.sec * NS_PER_S + stamp.nanosec, log_ns, values))
+    may_fill = JOINT_STATES, merged_note.get('position_control')
     others = {
         c.topic: c.msgtype
         for c in reader.connections
@@ -146,18 +146,38 @@ def _read_open(
         path=str(path),
         note=merged_note,
         mechanism=mechanism,
-        topics={name: _raw_topic(topics[name], rows) for name, rows in samples.items()},
+        topics={name: _raw_topic(topics[name], rows, may_fill) for name, rows in samples.items()},
         others=others,
     )
 
 
-def _raw_topic(topic: Topic, rows: list[tuple[int, int, dict[str, float]]]) -> RawTopic:
+def _topics_in(
+    path: Path, recorded: Mapping[str, str], note: Mapping[str, Any],
+    mechanism: channels.Mechanism,
+) -> dict[str, Topic]:  # fmt: skip
+    """The topics to read, by name, of those recorded (with their message types)."""
+    if name := note.get('position_control'):
+        if mechanism.told is None:
+            msg = f'{path}: note: position_control: drives of a {mechanism.name} are told torques'
+            raise RecordingError(msg)
+        torques = mechanism.torque.name, mechanism.command.name
+        found = {n: topic for n, topic in mechanism.topics.items() if n not in torques}
+        controller = recorded.get(name) == TRAJECTORY_STATE
+        kind = TRAJECTORY_STATE if controller else mechanism.told.msgtype
+        return {**found, name: replace(mechanism.told, name=name, msgtype=kind)}
+    has_torque = recorded.keys() & {mechanism.torque.name, mechanism.command.name}
+    return mechanism.topics if has_torque else mechanism.topics_with_effort
+
+
+def _raw_topic(
+    topic: Topic, rows: list[tuple[int, int, dict[str, float]]], may_fill: Collection[str]
+) -> RawTopic:
     nan = float('nan')
     values, absent = {}, {}
     for channel in topic.channels:
         column = [row[2].get(channel.name) for row in rows]
         # What a joint does not report, ros2_control's broadcaster fills with NaN throughout.
-        filled = topic.name == JOINT_STATES and channel.field != 'position'
+        filled = topic.name in may_fill and channel.field != 'position'
         if all(value is None or (filled and isnan(value)) for value in column):
             continue
         absent[channel.name] = np.array([value is None for value in column], dtype=bool)

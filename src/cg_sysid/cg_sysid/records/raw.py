@@ -49,6 +49,7 @@ NOTE = Mapping({
     'recording': Key(Text(), default=''),
     'effort': Key(Text(('measured', 'commanded')), default='measured'),
     'effort_gain': Key(MapOf(Number()), default={}),
+    'position_control': Key(Text(), default=''),
     'closed_loop': Key(Flag(), default=False),
     'notes': Key(Text(), default=''),
     'checklist': Key(CHECKLIST, default={}),
@@ -109,8 +110,15 @@ class RawRecording:
         return Path(self.path).name
 
     @property
+    def told(self) -> str:
+        """Topic on which drives were told positions; empty if they were told torques."""
+        return self.note.get('position_control') or ''
+
+    @property
     def torque_topic(self) -> str | None:
         """The topic that the torque is read from; None if there is none."""
+        if self.told:
+            return self.told
         for topic in (self.mechanism.torque, self.mechanism.command):
             if topic.name in self.topics:
                 return topic.name

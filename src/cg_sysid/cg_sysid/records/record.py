@@ -67,7 +67,7 @@ class Record:
                 f'{stamp[k - 1]}; stamps must increase strictly'
             )
         object.__setattr__(self, 'stamp_ns', _frozen(stamp.astype(np.int64)))
-        allowed_inputs = (*known.input_names, *known.extra_input_names)
+        allowed_inputs = (*known.input_names, *known.extra_input_names, *known.told_names)
         object.__setattr__(self, 'inputs', self._signals('input', self.inputs, allowed_inputs))
         object.__setattr__(
             self, 'outputs', self._signals('output', self.outputs, known.output_names)
