@@ -12,6 +12,10 @@ TRANSITION_RATE = Parameter(
     starts=(0.01,), scale=0.001, free=False, logarithmic=True,
     leeway=log(5.0), smoothing=True,
 )  # fmt: skip
+KNEE = Parameter(
+    'knee', '1', 'share of a law that comes to its level as x / sqrt(1 + x^2)', -1.0, 2.0,
+    neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0,
+)  # fmt: skip
 TAIL = 5 / 3  # the deviation from 1 of (2 / pi) arctan(pi x / 2) at large x is 0.4 / x
 
 
@@ -22,7 +26,8 @@ class CoulombFriction(Effect):
 
         x (1 + c |x|) / (1 + c |x| + c x^2),  x = rate / transition_rate, c = 5/3       (TAILS)
 
-    in the law, which has the slope and the tail of an arctan.
+    in the law, which has the slope and the tail of an arctan. Of a robot that somebody drew less
+    is known: there `knee` is the share of x / sqrt(1 + x^2), which lies in between.
     """
 
     name = 'coulomb_friction'
@@ -43,9 +48,15 @@ class CoulombFriction(Effect):
     )  # fmt: skip
     largest_step = 0.002
 
+    def parameters_in(self, mechanism):
+        """With a knee in space."""
+        return self.parameters if mechanism.dimensions == 2 else (*self.parameters, KNEE)
+
     def joint_torque(self, angle, rate, load, z, p):
         """Against the rate."""
         x = rate / p['transition_rate']
         slow = x * (1 + TAIL * ca.fabs(x)) / (1 + TAIL * ca.fabs(x) + TAIL * x**2)
         quick = ca.tanh(x)
+        if 'knee' in p:
+            quick += p['knee'] * (x / ca.sqrt(1 + x**2) - quick)
         return -p['torque'] * (quick + p['tails'] * (slow - quick)), []
