@@ -48,7 +48,8 @@ def section(effect, mechanisms) -> list[str]:
         f'### `{effect.name}`',
         effect.summary,
         '',
-        f'Acts {PLACES[effect.place]}. Sites, the usual one first: {where}.',
+        f'Acts {PLACES[effect.place]}. '
+        + (f'Sites, the usual one first: {where}.' if where else 'Only in robots of a URDF.'),
     ]
     if effect.states:
         lines.append(f'Extra states: {", ".join(f"`{state}`" for state in effect.states)}.')

@@ -10,6 +10,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cg_interfaces import channels
+from cg_sysid.checks.recordings import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
@@ -51,7 +52,7 @@ def header(stamp):
 
 
 def joint_state(stamp, **fields):
-    given = {f: np.asarray(fields.get(f, []), float) for f in ('position', 'velocity', 'effort')}
+    given = {f: np.ascontiguousarray(fields.get(f, []), float) for f in ('position', 'velocity', 'effort')}
     return STORE.types[JOINT_STATE](header=header(stamp), name=list(JOINTS), **given)
 
 
@@ -183,6 +184,46 @@ def test_commands_that_are_missing_or_no_numbers_are_refused(robot, tmp_path):
         read_bag(bag, mechanism=robot)
     with pytest.raises(RecordingError, match='drives of a pendulum are told torques'):
         read_bag(bag, mechanism=channels.mechanism('pendulum'))
+
+
+def codes(report, severity='error'):
+    return {(f.code, f.where) for f in report.findings if f.severity == severity}
+
+
+def checked(tmp_path, states, commands):
+    model = tmp_path / 'model.yaml'
+    model.write_text(followed().text())
+    bag = write(tmp_path / 'bag', states, commands)
+    return check_recording(bag, model)
+
+
+def lagging(times):
+    return ways(times - 0.04) + 5e-5 * np.random.default_rng(1).standard_normal((len(times), 3))
+
+
+TIMES = np.arange(0, 6, 0.004)
+
+
+def test_check_says_how_late_a_joint_follows(tmp_path):
+    report = checked(tmp_path, positions(TIMES, lagging(TIMES)), positions(TIMES, ways(TIMES)))
+    assert not codes(report)
+    lags = {f.where: f.value for f in report.findings if f.code == 'follows'}
+    assert lags == {f'{joint}_position': pytest.approx(0.04, abs=0.0051) for joint in JOINTS}
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'expected'),
+    [
+        (lambda q: q * [1, -1, 1], {('sign_error', 'thigh_joint_position')}),
+        (lambda q: np.degrees(q), {('unit', f'{joint}_position') for joint in JOINTS}),
+        (lambda q: q[:, [1, 0, 2]], {('joints_swapped', 'hip_joint_position'),
+                                     ('joints_swapped', 'thigh_joint_position')}),
+    ],
+    ids=['sign', 'degrees', 'swapped'],
+)  # fmt: skip
+def test_check_knows_ways_that_are_not_those_told(tmp_path, spoil, expected):
+    states = positions(TIMES, spoil(lagging(TIMES)))
+    assert codes(checked(tmp_path, states, positions(TIMES, ways(TIMES)))) == expected
 
 
 def following(tmp_path, robot, seconds=6.0, count=2, scale=1.0, law=lambda q, v: 0.0):

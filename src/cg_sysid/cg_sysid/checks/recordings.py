@@ -22,6 +22,7 @@ from cg_dynamics.model import Model
 from cg_interfaces.channels import Mechanism, interface
 from cg_sysid.checks.content import check_content
 from cg_sysid.checks.dynamics import check_dynamics
+from cg_sysid.checks.following import check_following
 from cg_sysid.checks.kinematics import check_kinematics
 from cg_sysid.checks.sampling import check_jitter
 from cg_sysid.checks.shifts import check_steps
@@ -92,6 +93,7 @@ def check_recording(
     sound = not any(finding.severity == 'error' for finding in findings)
     findings += overrule(check_dynamics(raw, signals, sound), anyway)
     findings += [*overrule(check_signs(raw, sane, robot), anyway), *unreadable]
+    findings += overrule(check_following(raw, sane), anyway)
     findings += check_content(raw, signals, model, use_region)
     if not any(finding.severity == 'error' for finding in findings):
         findings += _refused(raw)

@@ -24,6 +24,7 @@ COLOURS = {
 OVERRULABLE = {
     'clock_jump': 'time is wrong by an unknown amount from there on',
     'dropped_samples': 'what drove the machine in the gap is not known, or stamps hide the gap',
+    'joints_swapped': 'a fit would take one joint for another',
     'sampling_rate_change': 'the stamps do not know of it, so that time is wrong from there on',
     'sensor_clipping': 'what is recorded at the limit is not the motion',
     'sign_error': 'a fit would mirror the machine',
