@@ -52,7 +52,10 @@ def header(stamp):
 
 
 def joint_state(stamp, **fields):
-    given = {f: np.ascontiguousarray(fields.get(f, []), float) for f in ('position', 'velocity', 'effort')}
+    given = {
+        f: np.ascontiguousarray(fields.get(f, []), float)
+        for f in ('position', 'velocity', 'effort')
+    }
     return STORE.types[JOINT_STATE](header=header(stamp), name=list(JOINTS), **given)
 
 

@@ -21,6 +21,7 @@ from cg_sysid.identification.unknowns import Unknown, awake, own_unknowns, unset
 from cg_sysid.parallel import side_by_side
 
 RUNAWAY = 1e60
+LOST = 1e-30  # curvature beside the steepest one, below which there is none
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 
 
@@ -357,7 +358,9 @@ def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]
 
 def solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The x of a x = b for a curvature a; directions lost beside far steeper ones stay."""
-    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+    # Where sensitivities run away a small curvature is lost in rounding, and may be below nothing.
+    diagonal = np.diag(a)
+    scale = np.sqrt(np.maximum(diagonal, max(LOST * diagonal.max(initial=0.0), 1e-300)))
     scaled, b = a / np.outer(scale, scale), b / scale[:, None]
     try:
         x = np.linalg.solve(scaled, b)
