@@ -9,8 +9,11 @@ from hanging_arm import nominal, urdf
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from cg_dynamics.model import Model
 from cg_interfaces import channels
 from cg_sysid.checks.recordings import check_recording
+from cg_sysid.cli.new_robot import main as new_robot
+from cg_sysid.diagnosis.diagnose import Options, diagnose
 from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
@@ -189,6 +192,19 @@ def test_commands_that_are_missing_or_no_numbers_are_refused(robot, tmp_path):
         read_bag(bag, mechanism=channels.mechanism('pendulum'))
 
 
+def test_a_new_model_file_has_the_loops_of_drives_that_were_told_positions(robot, tmp_path):
+    times = np.arange(0, 2, 0.004)
+    told = ways(times) * [1, 0, 1]  # nobody ever told the thigh anything else than 0
+    bag = write(tmp_path / 'bag', positions(times, ways(times)), positions(times, told))
+    (tmp_path / 'leg.urdf').write_text(urdf())
+    out = tmp_path / 'leg.yaml'
+    words = [str(tmp_path / 'leg.urdf'), '--joint-states', str(bag), '--out', str(out)]
+    assert new_robot(words) == 0
+    loops = [effect for effect in Model.load(out).effects if effect.name == 'position_control']
+    assert [effect.site for effect in loops] == ['hip_joint', 'shank_joint']
+    assert 'state the gains of the drive' in out.read_text()
+
+
 def codes(report, severity='error'):
     return {(f.code, f.where) for f in report.findings if f.severity == severity}
 
@@ -285,3 +301,25 @@ def test_gains_that_are_off_are_found(robot, tmp_path):
     for joint, gains in GAINS.items():
         for name, value in gains.items():
             assert values[f'position_control@{joint}.{name}'] == pytest.approx(value, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('law', 'expected'),
+    [
+        (lambda q, v: 0.0, []),
+        pytest.param(
+            lambda q, v: np.array([0.0, 0.35, 0.0]), ['torque_bias@thigh_joint'],
+            marks=pytest.mark.evidence,
+        ),
+        (lambda q, v: np.array([0.0, 0.0, -0.05 * v[2] * abs(v[2])]),
+         ['quadratic_friction@shank_joint']),
+    ],
+    ids=['sound', 'bias', 'quadratic'],
+)  # fmt: skip
+def test_what_a_robot_lacks_that_follows_positions_is_named(robot, tmp_path, law, expected):
+    records = following(tmp_path, robot, count=4, law=law)
+    effects = ('torque_bias', 'encoder_offset', 'quadratic_friction', 'viscous_friction')
+    found = diagnose(followed(), records, Options(effects=effects, workers=1))
+    assert [cause.label for cause in found.causes] == expected
+    assert found.verdict == ('explained' if expected else 'consistent')

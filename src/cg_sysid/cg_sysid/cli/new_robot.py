@@ -59,6 +59,7 @@ OTHERS = """\
 # which an identification starts.
 """
 WIDTH = 99
+GUESSED = 'guessed: state the gains of the drive'
 DOUBT = 0.5  # of friction in a URDF, relative: it is a guess more often than not
 # Effect -> what a URDF's `dynamics` calls its size.
 FRICTION = {'viscous_friction': 'damping', 'coulomb_friction': 'friction'}
@@ -83,6 +84,8 @@ def template(
     )
     body = Urdf(description, driven, rates)
     noises = noise_of(records)
+    follows = any(set(record.inputs) & set(record.mechanism.told_names) for record in records)
+    effects = [*_effects(body, description, follows)]
     lines = [
         HEAD.format(source=source).rstrip(),
         f'format: {FORMAT}',
@@ -102,7 +105,7 @@ def template(
         *_bodies(body),
         '',
         EFFECTS.rstrip(),
-        *(list(_effects(body, description)) or ['effects: []']),
+        *(['effects:', *effects] if effects else ['effects: []']),
         *_others(body),
         '',
         '# How well each channel measures: the standard deviation of a sample, the smallest step.',
@@ -135,11 +138,14 @@ def noise_of(records: Sequence[Record]) -> Mapping[str, ChannelNoise]:
 
 def recorded_drives(records: Sequence[Record], body: Urdf) -> list[str]:
     """The joints of a robot on which something acted in recordings."""
-    return [
-        joint
-        for joint, channel in zip(body.driven, body.inputs, strict=True)
-        if any(np.any(record.inputs.get(channel, np.zeros(1)) != 0) for record in records)
-    ]
+    found = []
+    for joint, channel in zip(body.driven, body.inputs, strict=True):
+        position, _ = body.told(joint)
+        acted = (np.any(record.inputs.get(channel, np.zeros(1)) != 0) for record in records)
+        told = (np.ptp(record.inputs.get(position, np.zeros(1))) > 0 for record in records)
+        if any(acted) or any(told):
+            found.append(joint)
+    return found
 
 
 def _bodies(body: Urdf) -> Iterator[str]:
@@ -155,15 +161,24 @@ def _bodies(body: Urdf) -> Iterator[str]:
     yield f'  gravity: {flow(Quantity(9.81, "m/s^2", fixed=True, source="standard"))}'
 
 
-def _effects(body: Urdf, description: RobotDescription) -> Iterator[str]:
+def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterator[str]:
+    for joint in body.driven if follows else ():
+        loop = LIBRARY['position_control'](body, joint)
+        gains = {
+            p.name: flow(Quantity(p.default, p.unit, p.default, source=GUESSED))
+            for p in loop.parameters
+        }
+        yield f'- name: position_control   # {shortened(loop.summary, loop.name)}'
+        if len(body.coordinates) > 1:
+            yield f'  at: {joint}'
+        yield '  parameters:'
+        yield from (f'    {name}: {gain}' for name, gain in gains.items())
     stated = [
         (joint, name, getattr(joint, attribute))
         for joint in description.independent
         for name, attribute in FRICTION.items()
         if getattr(joint, attribute)
     ]
-    if stated:
-        yield 'effects:'
     for joint, name, value in stated:
         size = LIBRARY[name](body, joint.name).parameters[0]
         yield f'- name: {name}   # {shortened(LIBRARY[name].summary, name)}'
