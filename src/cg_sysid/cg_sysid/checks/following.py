@@ -24,10 +24,9 @@ MOVES = 20.0  # noise floors that a way must span before it is compared
 
 def check_following(raw: RawRecording, signals: Mapping[str, Signal]) -> Iterator[Finding]:
     """Findings about measured positions against those that the drives were told."""
-    told = raw.topics.get(raw.told)
-    if told is None:
+    told, known = raw.topics.get(raw.told), raw.mechanism
+    if told is None or known.told is None:
         return
-    known = raw.mechanism
     origin = min(int(t.stamp_ns.min()) for t in raw.topics.values() if len(t))
     ways: dict[str, tuple[Signal, str]] = {}
     for torque in known.torque.channels:

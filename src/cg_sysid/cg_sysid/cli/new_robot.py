@@ -162,15 +162,15 @@ def _bodies(body: Urdf) -> Iterator[str]:
 
 
 def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterator[str]:
-    for joint in body.driven if follows else ():
-        loop = LIBRARY['position_control'](body, joint)
+    for driven in body.driven if follows else ():
+        loop = LIBRARY['position_control'](body, driven)
         gains = {
             p.name: flow(Quantity(p.default, p.unit, p.default, source=GUESSED))
             for p in loop.parameters
         }
         yield f'- name: position_control   # {shortened(loop.summary, loop.name)}'
         if len(body.coordinates) > 1:
-            yield f'  at: {joint}'
+            yield f'  at: {driven}'
         yield '  parameters:'
         yield from (f'    {name}: {gain}' for name, gain in gains.items())
     stated = [

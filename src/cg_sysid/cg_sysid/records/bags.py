@@ -136,7 +136,7 @@ def _read_open(
             values = {name: gains.get(name, 1.0) * value for name, value in values.items()}
         stamp = message.header.stamp
         rows.append((stamp.sec * NS_PER_S + stamp.nanosec, log_ns, values))
-    may_fill = JOINT_STATES, merged_note.get('position_control')
+    may_fill = JOINT_STATES, merged_note.get('position_control', '')
     others = {
         c.topic: c.msgtype
         for c in reader.connections
