@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from cg_dynamics.assemble import parameter_vector, stamped
-from cg_dynamics.errors import SimulationError
+from cg_dynamics.errors import ModelError, SimulationError
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -63,6 +63,9 @@ class Plant:
         seed: Of the sensor noise.
         minimum_step: Not on blocks: the swing foot lands only this far ahead, m.
 
+    Raises:
+        ModelError: Its drives follow positions; it is told torques here.
+
     Attributes:
         stance: The leg pair that stands now.
     """
@@ -98,6 +101,9 @@ class Plant:
         self._input_delay, self._output_delays, _ = self._compiled.delays(self._p)
         self._torques = len(model.mechanism.inputs)
         names = self._compiled.input_names
+        told = [n for joint in model.mechanism.joints for n in model.mechanism.told(joint)]
+        if told := [name for name in told if name in names]:
+            raise ModelError(f'{model.name}: a simulated machine takes torques, not {told[0]}')
         self._applied = stamped(self._inputs(np.zeros(self._torques)), names, 0.0)
         self._latches: list[tuple[float, np.ndarray]] = [(-np.inf, self._applied)]
         self._x = self._compiled.initial_state(motion, self._applied, self._p)

@@ -9,7 +9,10 @@ from hanging_arm import nominal, urdf
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from cg_dynamics.errors import ModelError
 from cg_dynamics.model import Model
+from cg_dynamics.plant import Plant
+from cg_dynamics.rig import Setup
 from cg_interfaces import channels
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.cli.new_robot import main as new_robot
@@ -203,6 +206,11 @@ def test_a_new_model_file_has_the_loops_of_drives_that_were_told_positions(robot
     loops = [effect for effect in Model.load(out).effects if effect.name == 'position_control']
     assert [effect.site for effect in loops] == ['hip_joint', 'shank_joint']
     assert 'state the gains of the drive' in out.read_text()
+
+
+def test_a_simulated_machine_says_that_it_takes_torques():
+    with pytest.raises(ModelError, match='takes torques, not hip_joint_commanded_position'):
+        Plant(followed(), Setup())
 
 
 def codes(report, severity='error'):
