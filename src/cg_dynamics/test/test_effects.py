@@ -4,15 +4,25 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from cg_description.robot_description import parse
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.effects import LIBRARY, UNMODELLED, make_effect
 from cg_dynamics.effects.unmodelled import LearnedEffect
 from cg_dynamics.mechanisms import MECHANISMS
+from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model, simulate
 from cg_dynamics.walking.contact import contact_law
 
 COMPASS = MECHANISMS['compass_gait']
+SLIDER = Urdf(
+    parse(
+        '<robot name="slider"><link name="base"/><link name="cart"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="rail" type="prismatic"><parent link="base"/><child link="cart"/>'
+        '<axis xyz="1 0 0"/></joint></robot>'
+    )
+)
 EVERYWHERE = [(name, site) for name, effect in LIBRARY.items() for site in effect.sites(COMPASS)]
 TIME = np.arange(0, 0.6, 0.002)
 TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME))[:, None]
@@ -41,7 +51,7 @@ def test_effect_is_declared_completely(name):
     assert effect.name == name
     assert effect.summary.endswith('.') or '(Eq.' in effect.summary
     assert effect.parameters[0].neutral is not None
-    assert any(effect.sites(mechanism) for mechanism in MECHANISMS.values())
+    assert any(effect.sites(mechanism) for mechanism in (*MECHANISMS.values(), SLIDER))
     for p in effect.parameters:
         assert p.lower < p.upper
         assert all(p.lower <= start <= p.upper for start in p.starts), p.name
