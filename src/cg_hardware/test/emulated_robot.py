@@ -37,6 +37,10 @@ class Emulated:
         self.ask('report')
         return json.loads(self.process.stdout.readline())
 
+    def acted(self) -> set[int]:
+        """Torques since the last report. A host that then is busy for 16 ms ends the last one."""
+        return {torque for _, torque in self.report()['changes']}
+
     def __enter__(self) -> 'Emulated':
         self._niceness = os.getpriority(os.PRIO_PROCESS, 0)
         with contextlib.suppress(PermissionError):
