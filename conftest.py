@@ -74,7 +74,8 @@ def pytest_runtest_protocol(item):
                 watch.kill()
 
 
-@pytest.hookimpl(wrapper=True, tryfirst=True)
+# Innermost: the records of pytest's log have to be there before a skip, or its teardown fails.
+@pytest.hookimpl(wrapper=True, trylast=True)
 def pytest_runtest_setup(item):
     """A test marked `alone` waits for other programs to end, too."""
     if _watch not in item.stash:
