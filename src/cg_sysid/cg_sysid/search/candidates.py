@@ -157,9 +157,7 @@ def screen(task: Task, train: Sequence[DataSet]) -> Screening | Failure:
             beyond = _screened(
                 task, model, train, start=started_from(task.first, model, task.bounds)
             )
-            warm_starts = tuple(
-                sorted([beyond, *warm_starts], key=lambda warm_start: warm_start.normalised_error)
-            )
+            warm_starts = tuple(sorted([beyond, *warm_starts], key=cost))
             warm_starts = warm_starts[: settings.SCREENING.followed]
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return Failure(str(error))
@@ -314,12 +312,12 @@ def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     if eventful(task):
         return _event_fit(task, train)
     best = _own_fit(task, train)
-    if task.base is None or best.normalised_error <= task.base.normalised_error:
+    if task.base is None or cost(best) <= cost(task.base):
         return best
     model = next(_starting_models(task))
     start = started_from(task.base, model, task.bounds)
     again = _whole(task, model, train, start, task.iterations)
-    return min(best, again, key=lambda found: found.normalised_error)
+    return min(best, again, key=cost)
 
 
 def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
@@ -361,15 +359,14 @@ def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
         task, _chosen(model, warm_starts[0]), train, warm_starts[0], settings.SCREENING.following
     )
     for warm_start in warm_starts[1:]:
-        if (
-            best.normalised_error < settings.NOISE.settled
-            or warm_start.normalised_error > task.reach
-        ):
+        # What comes to the noise with numbers that nobody believes has a rival in beliefs.
+        done = best.normalised_error < settings.NOISE.settled and not far(best, task.bounds)
+        if done or warm_start.normalised_error > task.reach:
             break
         other = _whole(
             task, _chosen(model, warm_start), train, warm_start, settings.SCREENING.following
         )
-        best = min(best, other, key=lambda found: found.normalised_error)
+        best = min(best, other, key=cost)
     left = task.iterations - settings.SCREENING.following
     if best.converged or left < 1:
         return best
@@ -588,7 +585,12 @@ def _short_fits(
             failure = error
     if not found:
         raise failure
-    return sorted(found, key=lambda pair: pair[0].normalised_error)
+    return sorted(found, key=lambda pair: cost(pair[0]))
+
+
+def cost(found: Fit) -> float:
+    """chi2 and beliefs: fits that leave the same error may differ in what nobody believes."""
+    return found.normalised_error * float(found.count.sum()) + found.belief
 
 
 def _numbers(found: Fit) -> dict[str, float]:
@@ -740,10 +742,15 @@ def own_parameters(o: Outcome) -> dict[str, tuple[float, float, str]]:
 
 def prior_conflicts(o: Outcome) -> dict[str, float]:
     """Parameters that the fit puts far from what the file believes: tolerances away."""
+    return far(o.train, o.task.bounds)
+
+
+def far(found: Fit, bounds: Mapping[str, float]) -> dict[str, float]:
+    """The same of a fit with those bounds on small faults."""
     away = {
         u.name: abs(u.to_coordinate(v) - u.to_coordinate(u.prior)) / u.tolerance
-        for u, v in zip(o.train.unknowns, o.train.values, strict=True)
-        if np.isfinite(u.tolerance) and u.name not in o.task.bounds
+        for u, v in zip(found.unknowns, found.values, strict=True)
+        if np.isfinite(u.tolerance) and u.name not in bounds
     }
     return {
         name: tolerances
