@@ -5,7 +5,7 @@ extractor takes a message to the channels' values, and its composer goes the oth
 work on any object that has the fields of the ROS message: those of `rosbags`, or of rclpy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import atan2, cos, isfinite, sin, sqrt
 from typing import TYPE_CHECKING, Any
@@ -326,10 +326,17 @@ def extract(message: Any, topic: Topic) -> dict[str, float]:
 
 
 def _extract_joint_state(message: Any, topic: Topic) -> dict[str, float]:
-    names = list(message.name)
+    fields = {channel.field: getattr(message, channel.field) for channel in topic.channels}
+    return _by_joint(list(message.name), fields, topic)
+
+
+def _by_joint(
+    names: list[str], fields: Mapping[str, Sequence[float]], topic: Topic
+) -> dict[str, float]:
+    """Values of a topic's channels from fields that hold one for each joint, or none."""
     values = {}
     for channel in topic.channels:
-        field = getattr(message, channel.field)
+        field = fields[channel.field]
         if channel.joint not in names or len(field) == 0:
             continue
         index = names.index(channel.joint)
@@ -361,18 +368,8 @@ POINT_FIELDS = {'position': 'positions', 'velocity': 'velocities', 'effort': 'ef
 
 def _extract_trajectory_state(message: Any, topic: Topic) -> dict[str, float]:
     """What a controller of trajectories told its joints at that instant."""
-    names = list(message.joint_names)
-    values = {}
-    for channel in topic.channels:
-        told = getattr(message.reference, POINT_FIELDS[channel.field])
-        if channel.joint not in names or len(told) == 0:
-            continue
-        index = names.index(channel.joint)
-        if index >= len(told):
-            msg = f'reference holds {len(told)} values for {len(names)} joint names'
-            raise ValueError(msg)
-        values[channel.name] = float(told[index])
-    return values
+    told = {field: getattr(message.reference, name) for field, name in POINT_FIELDS.items()}
+    return _by_joint(list(message.joint_names), told, topic)
 
 
 EXTRACTORS: dict[str, Callable[[Any, Topic], dict[str, float]]] = {
