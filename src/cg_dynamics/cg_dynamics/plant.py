@@ -203,7 +203,7 @@ class Plant:
             return
         (reach, height), (reach_then, height_then) = self._foot(before), self._foot(self._x)
         # Legs that balance side by side pass each other all the time: none of that is a landing,
-        # and to locate it would cost twenty times the step itself.
+        # and each instant that is tried for one costs a step.
         if not height > 0 >= height_then or max(reach, reach_then) <= self._minimum_step:
             return
         duration = step * steps
