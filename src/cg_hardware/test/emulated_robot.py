@@ -9,6 +9,14 @@ from pathlib import Path
 
 READY = 60.0  # s in which it is there, compilation included
 PRIORITY = -10  # niceness that the drive's node has as well, where it may be had
+PATIENCE = 2.0  # s that host and drive wait for each other in tests that are not about time
+
+
+def wait_longer(monkeypatch) -> None:
+    """A busy host is no fault: drives that are opened from here on wait, and are waited for."""
+    monkeypatch.setattr('cg_hardware.drive.can_drive.SILENCE_S', PATIENCE)
+    for module in ('can_drive', 'watch'):
+        monkeypatch.setattr(f'cg_hardware.drive.{module}.PATIENCE_MS', int(1000 * PATIENCE))
 
 
 class Emulated:

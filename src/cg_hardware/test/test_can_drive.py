@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip('canopen')
 
-from emulated_robot import Emulated
+from emulated_robot import Emulated, wait_longer
 
 from cg_hardware.drive.can_drive import CanDrive
 from cg_hardware.drive.cia402 import State
@@ -32,7 +32,17 @@ def robot(tmp_path):
 
 
 @pytest.fixture
-def drive(robot):
+def drive(robot, monkeypatch):
+    """One that a busy host may hold up: for what is not about time."""
+    wait_longer(monkeypatch)
+    drive = CanDrive(robot.bus, node=1, sign=-1.0, gear=0.5)
+    yield drive
+    drive.close()
+
+
+@pytest.fixture
+def prompt(robot):
+    """One that is lost as soon as in use."""
     drive = CanDrive(robot.bus, node=1, sign=-1.0, gear=0.5)
     yield drive
     drive.close()
@@ -102,16 +112,16 @@ def test_a_fault_stays_one_until_a_person_says_otherwise(robot, drive):
     assert -200 in robot.acted()
 
 
-def test_a_host_that_falls_silent_costs_the_torque(robot, drive):
-    enabled(drive, 4.0)
-    spin(drive, 0.1, 4.0)
+def test_a_host_that_falls_silent_costs_the_torque(robot, prompt):
+    enabled(prompt, 4.0)
+    spin(prompt, 0.1, 4.0)
     robot.report()
     time.sleep(0.2)  # the host is busy
     report = robot.report()
     assert (report['state'], report['acting']) == ('fault', 0)
-    spin(drive, 0.2, 4.0)
-    assert not drive.wanted
-    assert drive.reason in HELD_UP
+    spin(prompt, 0.2, 4.0)
+    assert not prompt.wanted
+    assert prompt.reason in HELD_UP
     assert robot.report()['changes'] == []
 
 
@@ -185,18 +195,18 @@ def test_outputs_are_set_as_far_as_they_are_the_hosts(robot):
     assert robot.report()['outputs'] == 0
 
 
-def test_a_drive_that_falls_silent_is_given_up(robot, drive):
-    enabled(drive, 4.0)
-    spin(drive, 0.1, 4.0)
+def test_a_drive_that_falls_silent_is_given_up(robot, prompt):
+    enabled(prompt, 4.0)
+    spin(prompt, 0.1, 4.0)
     robot.report()
     robot.ask('can_silent')
-    assert spin(drive, 1.0, 4.0, lambda: not drive.wanted)
-    assert drive.reason == 'the drive is silent'
-    spin(drive, 0.1, 4.0)
+    assert spin(prompt, 1.0, 4.0, lambda: not prompt.wanted)
+    assert prompt.reason == 'the drive is silent'
+    spin(prompt, 0.1, 4.0)
     robot.ask('can_back')
-    spin(drive, 0.2, 4.0)
+    spin(prompt, 0.2, 4.0)
     assert robot.report()['acting'] == 0
-    assert not drive.wanted
+    assert not prompt.wanted
 
 
 def test_garbage_between_frames_costs_at_most_a_frame(robot, drive):
@@ -205,24 +215,24 @@ def test_garbage_between_frames_costs_at_most_a_frame(robot, drive):
     for _ in range(20):
         robot.ask('can_garbage 40')  # nearly always with bytes that are no text
         spin(drive, 0.02, 4.0)
-    assert drive.reason in ('', *HELD_UP)
+    assert drive.reason == ''
     assert len(drive.answers) > 100  # of 200
     robot.ask('can_garbage 1000')
     drive.answers.clear()
     assert spin(drive, 2.0, 4.0, lambda: len(drive.answers) > 20)
 
 
-def test_noise_on_the_line_is_a_silent_drive_and_can_end(robot, drive):
+def test_noise_on_the_line_is_a_silent_drive_and_can_end(robot, prompt):
     for _ in range(5):  # a busy machine is late by itself
-        enabled(drive, 4.0)
-        spin(drive, 0.1, 4.0)
+        enabled(prompt, 4.0)
+        spin(prompt, 0.1, 4.0)
         before = robot.report()
         robot.ask('can_noise 1000000000')
-        assert spin(drive, 1.0, 4.0, lambda: not drive.wanted)
-        spin(drive, 0.05, 4.0)
+        assert spin(prompt, 1.0, 4.0, lambda: not prompt.wanted)
+        spin(prompt, 0.05, 4.0)
         report = robot.report()
         robot.ask('can_noise 0')
-        assert spin(drive, 2.0, until=lambda: drive.state is not None)
+        assert spin(prompt, 2.0, until=lambda: prompt.state is not None)
         took = report['changes'][-1][0] - before['time']
         if took < AT_MOST + PERIOD:  # from a report, which is a cycle old at most
             break
@@ -230,14 +240,14 @@ def test_noise_on_the_line_is_a_silent_drive_and_can_end(robot, drive):
     assert took < AT_MOST + PERIOD
 
 
-def test_a_drive_that_was_switched_off_is_set_up_anew(robot, drive):
-    enabled(drive)
+def test_a_drive_that_was_switched_off_is_set_up_anew(robot, prompt):
+    enabled(prompt)
     robot.ask('drive_off')
-    assert spin(drive, 1.0, until=lambda: not drive.wanted)
+    assert spin(prompt, 1.0, until=lambda: not prompt.wanted)
     robot.ask('drive_on')
-    spin(drive, 0.2)
-    assert drive.state is None  # its mapping is gone
-    drive.close()
+    spin(prompt, 0.2)
+    assert prompt.state is None  # its mapping is gone
+    prompt.close()
     again = CanDrive(robot.bus, node=1)
     try:
         enabled(again, 4.0)
@@ -247,14 +257,14 @@ def test_a_drive_that_was_switched_off_is_set_up_anew(robot, drive):
         again.close()
 
 
-def test_a_bus_that_is_pulled_is_an_error_and_can_be_closed(robot, drive):
-    enabled(drive, 4.0)
-    spin(drive, 0.1, 4.0)
+def test_a_bus_that_is_pulled_is_an_error_and_can_be_closed(robot, prompt):
+    enabled(prompt, 4.0)
+    spin(prompt, 0.1, 4.0)
     robot.ask('can_unplug')
     with pytest.raises(DriveError, match='drive 1'):
-        spin(drive, 2.0, 4.0)
-    assert 'the bus is gone' in drive.reason or drive.reason == 'the drive is silent'
-    drive.close()
+        spin(prompt, 2.0, 4.0)
+    assert 'the bus is gone' in prompt.reason or prompt.reason == 'the drive is silent'
+    prompt.close()
     time.sleep(0.2)
     assert robot.report()['acting'] == 0
 
