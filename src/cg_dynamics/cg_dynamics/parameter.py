@@ -39,7 +39,8 @@ class Parameter:
             pieces of one together; the value in a model stands for those that nobody has seen.
             Empty for a property of the machine.
         leeway: Of a parameter of shape, a device of the model: how far from its value the law of
-            a real machine may lie, in `unit`, or as a logarithm where it is logarithmic.
+            a real machine may lie, in `unit`, or as a logarithm where it is logarithmic. A
+            smoothing may come down to `lower`, whatever its leeway.
         along: Unit on a joint that slides where that is not `sliding_unit(unit)`: a phase stays
             one.
         smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn

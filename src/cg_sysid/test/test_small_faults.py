@@ -17,6 +17,7 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen
+from cg_sysid.search.model_selection import Comparison
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
 
 EFFECTS = (
@@ -131,24 +132,37 @@ def test_friction_that_gives_way_a_little_is_no_cause_and_hides_none(nominal):
 
 
 @pytest.mark.parametrize(
-    ('deflection', 'left', 'ends'), [(2e-3, 0.4, True), (2e-3, 5.0, False), (4e-3, 0.4, False)]
+    ('deflection', 'left', 'cause', 'ends'),
+    [
+        (2e-3, 0.4, None, True),
+        (2e-3, 5.0, None, False),
+        (4e-3, 0.4, None, False),
+        (2e-3, 0.1, 80.0, True),
+        (2e-3, 0.4, 80.0, False),  # it may leave that cause
+        (2e-3, 0.1, 120.0, False),
+    ],
 )
 def test_such_friction_ends_the_search_only_near_the_noise(
-    nominal, monkeypatch, deflection, left, ends
+    nominal, monkeypatch, deflection, left, cause, ends
 ):
+    """Evidence 100 nats for it, `cause` for another that is earned."""
     name = 'presliding_friction'
     above = {'base': 100.0, name: left}  # chi2/N less 1
     monkeypatch.setattr(small_faults, 'above_noise', lambda o: above[o.label])
+    monkeypatch.setattr(small_faults, 'at_noise', lambda o: above[o.label] < 0.3)
     sizes = {'deflection': (deflection, 2e-5, 'rad')}
     model = nominal.with_effect(name, None, torque=0.4, deflection=deflection)
     fit_there = SimpleNamespace(model=model)
     o = Outcome(
         Task(nominal, (name, None)), name, model, fit_there, fit_there, (), 0.0, 0, {}, ((), ()),
     )  # fmt: skip
-    candidate = SimpleNamespace(
-        label=name, parameters=sizes, reason='; '.join(as_sound_robots(name, sizes))
-    )
-    comparison = SimpleNamespace(base=replace(o, label='base'), ranked=((candidate, o),))
+    reason = '; '.join(as_sound_robots(name, sizes))
+    law = SimpleNamespace(label=name, parameters=sizes, reason=reason, evidence=100.0)
+    ranked = [(law, o)]
+    if cause is not None:
+        other = SimpleNamespace(label='torque_bias', parameters={}, reason='', evidence=cause)
+        ranked.append((other, replace(o, label='base')))
+    comparison = Comparison(replace(o, label='base'), tuple(ranked), independent=1e3, margin=6.0)
     assert (small_faults.sound_law(comparison) is not None) == ends
 
 

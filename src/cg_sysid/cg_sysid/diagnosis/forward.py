@@ -22,9 +22,9 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         winner = None
         if not done(work, o):
             comparison = of_size(work, compare(work, o))
-            o, winner = comparison.base, comparison.winner()
+            work.law = sound_law(comparison)
+            o, winner = comparison.base, None if work.law else comparison.winner()
             work.note(comparison, winner[0].label if winner else '')
-            work.law = sound_law(comparison) if winner is None else None
             if work.law is not None:
                 break
         if winner is not None:

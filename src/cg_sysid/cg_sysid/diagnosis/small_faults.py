@@ -53,10 +53,15 @@ def sound_law(comparison: Comparison) -> Outcome | None:
 
     It is no cause, and too dear to be let go in every fit. But what it takes is none's to explain,
     so that the search ends there; it must come near the noise, or something else is wrong too.
+    Where a cause is earned it must be better than that, and come to the noise.
     """
-    base = comparison.base
+    base, winner = comparison.base, comparison.winner()
     most = min((1 - settings.DOUBT.nearly_all) * above_noise(base), settings.NOISE.quick - 1)
     for candidate, o in comparison.ranked:
+        if winner and not (
+            candidate.evidence > winner[0].evidence + comparison.margin and at_noise(o)
+        ):
+            continue
         law, label = SOUND_LAWS.get(effect_name(candidate.label)), candidate.label
         sound = as_sound_robots(label, candidate.parameters)
         if law and sound and candidate.reason == sound[0] and above_noise(o) < most:

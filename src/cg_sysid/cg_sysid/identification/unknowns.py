@@ -106,6 +106,8 @@ def _bounded(name: str, parameter: Parameter, value: float, bound: float) -> Unk
         lower, upper = value * np.exp(-bound), value * np.exp(bound)
     else:
         lower, upper = value - bound, value + bound
+    if parameter.smoothing:
+        lower = parameter.lower  # machines turn as fast as they like
     return Unknown(
         name, parameter.unit, value, bound, max(lower, parameter.lower),
         min(upper, parameter.upper), parameter.logarithmic, parameter.scale,
