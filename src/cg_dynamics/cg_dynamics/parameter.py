@@ -39,8 +39,7 @@ class Parameter:
             pieces of one together; the value in a model stands for those that nobody has seen.
             Empty for a property of the machine.
         leeway: Of a parameter of shape, a device of the model: how far from its value the law of
-            a real machine may lie, in `unit`, or as a logarithm where it is logarithmic. A
-            smoothing may come down to `lower`, whatever its leeway.
+            a real machine may lie, in `unit`, or as a logarithm where it is logarithmic.
         along: Unit on a joint that slides where that is not `sliding_unit(unit)`: a phase stays
             one.
         smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn

@@ -15,6 +15,7 @@ from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
+from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen
 from cg_sysid.search.model_selection import Comparison
@@ -71,6 +72,25 @@ def test_small_faults_alone_are_consistent(nominal):
     assert any(f.startswith('actuator_delay.delay = ') for f in found.findings)
     identified = found.extended.train.model.values['actuator_delay.delay']
     assert identified == pytest.approx(0.001, rel=0.05)  # a quarter of a sample
+
+
+@pytest.mark.slow
+def test_hard_friction_is_consistent(nominal):
+    """Friction that turns fifty times as fast as the model was drawn."""
+    key = 'coulomb_friction.transition_rate'
+    machine = nominal.with_values({key: nominal.values[key] / 50})
+    found = diagnose(nominal, _records(machine), Options(effects=EFFECTS, workers=1))
+    assert found.verdict == 'consistent'
+    values = found.extended.train.model.values
+    assert values[key] < nominal.values[key] / 20
+
+
+def test_friction_gets_ever_harder_but_no_softer_than_its_leeway(nominal):
+    key = 'coulomb_friction.transition_rate'
+    for bound, factor in ((math.log(5.0), 5.0), (math.log(100.0), 100.0)):
+        found = next(u for u in unknowns_of(nominal, bounds={key: bound}) if u.name == key)
+        assert found.lower == pytest.approx(nominal.values[key] / factor)
+        assert found.upper == pytest.approx(nominal.values[key] * 5.0)
 
 
 @pytest.mark.slow

@@ -21,15 +21,10 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
     added = work.added(base)
     key = added, bool(base.task.bounds)
     if key not in work.comparisons:
-        recorded = {name for data_set in work.train for name in data_set.input_names}
-        bounds = base.task.bounds
-        effects = candidates_for(
-            base.model, work.setups(), work.options.effects, recorded,
-            nuisances(base.model, bounds),
-        )  # fmt: skip
+        effects = effects_on(work, base)
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
-        said = scores(base.model, work.train, effects, bounds, work.carry_out)
+        said = scores(base.model, work.train, effects, base.task.bounds, work.carry_out)
         if said is not None:
             work.torques[key] = said
             effects = said.worth(effects)
@@ -45,6 +40,13 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
         comparison = work.selection.compare(base, outcomes)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
+
+
+def effects_on(work: Workspace, base: Outcome) -> Effects:
+    """All that can be tried on top of a base."""
+    recorded = {name for data_set in work.train for name in data_set.input_names}
+    small = nuisances(base.model, base.task.bounds)
+    return candidates_for(base.model, work.setups(), work.options.effects, recorded, small)
 
 
 def led_deeper(

@@ -3,6 +3,7 @@
 from cg_sysid.diagnosis.comparing import compare, done, refitted
 from cg_sysid.diagnosis.small_faults import (
     bare,
+    law_at_once,
     of_size,
     rather_one_cause,
     sound_law,
@@ -21,6 +22,9 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         plain, o = o, with_small_faults(work, o)
         winner = None
         if not done(work, o):
+            work.law = law_at_once(work, o)
+            if work.law is not None:
+                break
             comparison = of_size(work, compare(work, o))
             work.law = sound_law(comparison)
             o, winner = comparison.base, None if work.law else comparison.winner()

@@ -4,7 +4,9 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cg_sysid.diagnosis.comparing import compare, refitted
+import numpy as np
+
+from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.search import settings
@@ -44,8 +46,58 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
         return o
     if at_noise(o):
         return found if settled(found) else o  # only beliefs are at stake
+    found = with_hard_friction(work, found)
     # Beside a large cause they would explain a little of it; then they can wait.
     return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
+
+
+def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
+    """The same with dry friction that turns as fast as it likes, where it does so as it may.
+
+    Not from the start: the harder friction is, the rougher is the way to the minimum.
+    """
+    bounds, declared = dict(o.task.bounds), o.model.declarations
+    for u, value in zip(o.train.unknowns, o.train.values, strict=True):
+        if (
+            u.name in bounds
+            and declared[u.name].smoothing
+            and value < settings.DOUBT.hard * u.lower
+        ):
+            bounds[u.name] = float(np.log(u.prior / declared[u.name].lower))
+    if bounds == o.task.bounds:
+        return o
+    task = Task(o.model, events=o.events, bounds=bounds)
+    task = replace(task, warm_starts=(started_from(o.train, o.model, bounds),))
+    title = f'{title_of(work.added(o))}, with hard friction'
+    hard = work.halving.fit([task], title)[0]
+    return hard if isinstance(hard, Outcome) and chi2(hard) < chi2(o) else o
+
+
+def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:
+    """The base with a law that sound machines follow, where that alone comes to the noise.
+
+    Then the library is not tried at all. Who imitates such a law leaves what is far from white.
+    """
+    dry = {effect.at for effect in o.model.effects if effect.friction == 'dry'}
+    laws = [(name, at) for name, at in effects_on(work, o) if name in SOUND_LAWS and at in dry]
+    if not laws or not o.task.bounds:
+        return None
+    task = alone(work, o)
+    title = f'laws of sound machines on top of {title_of(work.added(o))}'
+    looks = work.halving.screen([replace(task, effect=law) for law in laws], title)
+    near = [look.task for look in looks if look.error < settings.NOISE.quick]
+    fits = [replace(task, reach=settings.NOISE.quick) for task in near]
+    found = [fit for fit in work.halving.fit(fits, title) if isinstance(fit, Outcome)]
+    comparison = work.selection.compare(o, found)
+    law = sound_law(comparison)
+    if (
+        law is None
+        or not at_noise(law)
+        or work.selection.whiteness(law) < settings.NOISE.half_white
+    ):
+        return None
+    work.note(comparison, '')
+    return law
 
 
 def sound_law(comparison: Comparison) -> Outcome | None:

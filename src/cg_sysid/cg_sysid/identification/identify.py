@@ -54,6 +54,7 @@ SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit bette
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
 BACK = 5  # steps across a valley after one uphill, at most
+CLOSE = 100.0  # chi2/N; farther from the noise nobody needs the floor of a valley
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
@@ -477,7 +478,7 @@ def _minimise(
         if _out_of_reach(errors, reach):
             return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
         trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
-        for _ in range(BACK):
+        for _ in range(BACK if _error(point) < CLOSE else 0):
             if candidate is None or not point.cost < candidate.cost < valley.uphill * point.cost:
                 break
             # A step along a curved valley leaves its floor: back to it, across the valley.

@@ -62,7 +62,8 @@ def unknowns_of(
         model: The model.
         only: Full names of those to move instead.
         bounds: Parameters that move by so much at most, free or not: full name -> largest
-            distance from the model's value, in the coordinate in which it is moved.
+            distance from the model's value, in the coordinate in which it is moved. A smoothing
+            never gets wider by more than its leeway.
 
     Raises:
         IdentificationError: if `only` names something that the model does not have.
@@ -103,11 +104,10 @@ def unknowns_of(
 
 def _bounded(name: str, parameter: Parameter, value: float, bound: float) -> Unknown:
     if parameter.logarithmic:
-        lower, upper = value * np.exp(-bound), value * np.exp(bound)
+        up = min(bound, parameter.leeway) if parameter.smoothing else bound
+        lower, upper = value * np.exp(-bound), value * np.exp(up)
     else:
         lower, upper = value - bound, value + bound
-    if parameter.smoothing:
-        lower = parameter.lower  # machines turn as fast as they like
     return Unknown(
         name, parameter.unit, value, bound, max(lower, parameter.lower),
         min(upper, parameter.upper), parameter.logarithmic, parameter.scale,

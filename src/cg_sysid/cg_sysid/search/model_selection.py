@@ -258,8 +258,12 @@ class ModelSelection:
         error = base.train.normalised_error
         return error - settings.SELECTION.half_seen * min(least, max(error - 1.0, 0.0))
 
+    def whiteness(self, o: Outcome) -> float:
+        """Share of independent samples in what is left; 1 of white noise."""
+        return independent_samples(o.residuals, self.steps) / samples(o)
+
     def _white(self, o: Outcome) -> bool:
-        return independent_samples(o.residuals, self.steps) > settings.NOISE.white * samples(o)
+        return self.whiteness(o) > settings.NOISE.white
 
 
 def _immaterial(o: Outcome) -> bool:

@@ -62,6 +62,7 @@ class Noise:
         much_wrong: From here on much is wrong with a model.
         quietest: Of an output of which nothing is wrong, at least.
         white: Share of independent samples from which a residual counts as white noise, [1].
+        half_white: The same beside a law that sound machines follow, which is drawn roughly.
     """
 
     at_noise: float = 1.3
@@ -71,6 +72,7 @@ class Noise:
     much_wrong: float = 1.5
     quietest: float = 0.9
     white: float = 0.9
+    half_white: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -203,6 +205,7 @@ class Doubt:
         outstanding_times: And as many times its even share.
         nearly_all: Of the squared error above the noise: a cause of another shape than its law's,
             or a law that sound machines follow.
+        hard: Of the least rate over which friction may turn, up to which it turns as fast as that.
         as_found: Relative, within which the number that tells such a law sound stays from then on.
     """
 
@@ -216,6 +219,7 @@ class Doubt:
     outstanding: float = 0.2
     outstanding_times: int = 4
     nearly_all: float = 0.9
+    hard: float = 1.01
     as_found: float = 0.01
 
 
