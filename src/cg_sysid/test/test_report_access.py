@@ -115,6 +115,15 @@ def test_every_plot_that_is_drawn_by_the_script_gets_a_title():
     assert all('title: ' in call[:200] for call in calls)
 
 
+def test_every_torque_of_a_robot_has_a_line_and_a_key():
+    report = resources.files('cg_sysid.report')
+    script, style = (report.joinpath(n).read_text('utf-8') for n in ('plots.js', 'page.css'))
+    colours = int(re.search(r'COLOURS = (\d+)', script)[1])
+    drawn = [re.search(rf'\.line\.torque{i} {{ stroke: (\S+); }}', style) for i in range(colours)]
+    assert len({found[1] for found in drawn}) == colours
+    assert all(f'.legend .k-torque{i} ' in style for i in range(colours))
+
+
 def _colours(style):
     """Variables of the page by day and by night: name -> (red, green, blue), each 0 to 1."""
     blocks = re.findall(r':root \{(.*?)\}', style, re.DOTALL)

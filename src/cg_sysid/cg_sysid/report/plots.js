@@ -92,6 +92,8 @@
     if (parent) parent.appendChild(made);
     return made;
   }
+  const COLOURS = 7; // of torques (page.css)
+  function words(name) { return name.replace(/_/g, ' '); }
   function html(name, cls, parent, text) {
     const made = document.createElement(name);
     if (cls) made.className = cls;
@@ -334,8 +336,16 @@
       y = padded(extent(inputs, from, to), 0.08, 0.1);
       drawn.push(chart(hosts[2], { height: 122, title: pushes[0],
         x: { lo: x.lo, hi: x.hi, label: 'time in s' },
-        lines: inputs.map((v, i) => ({ x: t, y: v, cls: 'torque' + i })),
+        lines: inputs.map((v, i) => ({ x: t, y: v, cls: 'torque' + i % COLOURS })),
         y: { lo: y[0], hi: y[1], label: driven } }));
+      if (inputs.length > 1) {
+        const legend = html('div', 'legend', hosts[2]);
+        data.inputs.forEach((name, i) => {
+          const key = html('span', '', legend);
+          html('i', 'k-torque' + i % COLOURS, key);
+          key.append(words(name));
+        });
+      }
       drawn.forEach((d, i) => interactive(d, i, t, measured, sim, inputs, channel));
     }
 
@@ -362,7 +372,8 @@
         readout.textContent = 't ' + t[i].toFixed(3) + ' s   measured ' + short(measured[i]) + b +
           '   ' + (both ? 'after ' : 'simulated ') + short(sim.after[i]) + ' ' +
           (channel.unit === '1' ? '' : channel.unit) +
-          inputs.map((v, k) => '   ' + (data.input_units[k] === 'N' ? 'force ' : 'torque ') +
+          inputs.map((v, k) => '   ' + (inputs.length > 1 ? words(data.inputs[k])
+            : data.input_units[k] === 'N' ? 'force' : 'torque') + ' ' +
             short(v[i]) + ' ' + data.input_units[k]).join('');
         if (start !== null) {
           mark.setAttribute('x', Math.min(start, p));

@@ -28,6 +28,10 @@ def rounds(facts: Facts) -> Markup | None:
     )  # fmt: skip
 
 
+def _count(candidates: list[Facts]) -> str:
+    return f'{len(candidates)} candidate{"s" if len(candidates) != 1 else ""}'
+
+
 def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
     candidates = r['candidates']
     taken = r['accepted']
@@ -40,7 +44,7 @@ def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
     return tag('div',
         tag('details',
             tag('summary', f'Round {k}: on top of {base} ',
-                tag('span', f'\u2013 {len(candidates)} candidates, {outcome}', class_='soft')),
+                tag('span', f'\u2013 {_count(candidates)}, {outcome}', class_='soft')),
             wide(f'Candidates of round {k}', table),
             tag('details', tag('summary', f'{len(rest)} more candidates'),
                 wide(f'More candidates of round {k}', _ranking(rest, taken, rivals, strongest)))
