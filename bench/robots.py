@@ -412,12 +412,13 @@ def main() -> int:
     lines = [*table_of(shown), '', *every_one(shown)]
     print('\n'.join(lines))
     if options.write:
-        drawn = f', {len(shown)} of them run' if len(shown) < len(cases) else ''
+        every = len(programme())
+        drawn = f', {len(shown)} of them run' if len(shown) < every else ''
         options.write.write_text('\n'.join([
             '# Robots of a URDF that share no code with the models', '',
             'Command: `./cg exec python bench/robots.py`; this table of its rows: the same with '
             f'`--table-only --write FILE`. Sources {shown[0]["version"]}.',
-            f'The programme: {len(cases)} cases{drawn}. What is right is written at the head of '
+            f'The programme: {every} cases{drawn}. What is right is written at the head of '
             'the bench, and was settled before any case was run.', '', *lines, '',
         ]))  # fmt: skip
     return 0
