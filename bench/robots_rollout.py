@@ -33,7 +33,7 @@ from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model
 from cg_interfaces import channels
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.identification.simulation_error import Problem, simulate_sensitive
+from cg_sysid.identification.simulation_error import Problem, follow
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.records.record import Record
 
@@ -105,14 +105,14 @@ def row(joints: int) -> str:
     values = np.array([unknown.prior for unknown in unknowns])
     motion = problem.guesses[0]
     began = time.perf_counter()
-    simulate_sensitive(problem, 0, values, motion, np.inf)
+    follow(problem, 0, values, motion, np.inf).normal()
     compile_s = time.perf_counter() - began
     theirs, data = engine(text), None
     data = mujoco.MjData(theirs)
     start = np.zeros((1, mujoco.mj_stateSize(theirs, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     calls = {
         'ours': lambda: compiled.simulate(moment, u, x0, p),
-        'fit': lambda: simulate_sensitive(problem, 0, values, motion, np.inf),
+        'fit': lambda: follow(problem, 0, values, motion, np.inf).normal(),
         'mujoco': lambda: rollout.rollout(theirs, data, start, nstep=ROWS - 1),
     }
     spent = {name: [] for name in calls}

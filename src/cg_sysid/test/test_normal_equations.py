@@ -14,8 +14,8 @@ from cg_sysid.identification.simulation_error import (
     Point,
     Problem,
     evaluate,
+    follow,
     reduced,
-    simulate_sensitive,
     solve,
 )
 from cg_sysid.identification.unknowns import unknowns_of
@@ -48,7 +48,7 @@ def test_a_robot_without_a_border_of_consistency_has_the_curvature_of_its_sensit
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motion = problem.guesses[0]
     point = evaluate(problem, theta, [motion], np.inf, 1.0)
-    _, _, _, jacobian = simulate_sensitive(problem, 0, values, motion, np.inf, keep=True)
+    _, _, jacobian = follow(problem, 0, values, motion, np.inf).normal(keep=True)
     shared = jacobian[:, :, len(motion) :] / data_sets[0].sigma[:, None] * problem.chain(values)
     shared = shared.reshape(-1, len(unknowns))
     belief = [1 / u.tolerance**2 if np.isfinite(u.tolerance) else 0.0 for u in unknowns]

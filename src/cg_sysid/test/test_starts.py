@@ -15,7 +15,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import identify
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit, predict, score
-from cg_sysid.identification.simulation_error import evaluate
+from cg_sysid.identification.simulation_error import attempt
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, own_parameters, try_candidate
 
@@ -253,11 +253,11 @@ def test_steps_that_are_too_long_give_no_fit_up(model_file, monkeypatch):
     data_sets = prepare(nominal, [_record(machine, k) for k in range(2)])
     steps = []
 
-    def runs_away_at_first(problem, theta, motions, horizon, weight):
+    def runs_away_at_first(problem, theta, motions, horizon):
         steps.append(theta)
-        return None if 2 <= len(steps) <= 4 else evaluate(problem, theta, motions, horizon, weight)
+        return None if len(steps) <= 3 else attempt(problem, theta, motions, horizon)
 
-    monkeypatch.setattr(identify, 'evaluate', runs_away_at_first)
+    monkeypatch.setattr(identify, 'attempt', runs_away_at_first)
     found = fit(nominal, data_sets, ['c5'], horizon=0.5, reach=1.1)
     assert found.normalised_error < 1.2
     assert found.values[0] == pytest.approx(machine.values['c5'], abs=5 * found.sigmas[0])

@@ -33,7 +33,7 @@ STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstab
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of one record (NativeRollout.cgm_normal).
+    """Normal equations of one record (Judged.normal).
 
     Attributes:
         hessian: Sum of J'WJ, shape (nc, nc).
@@ -272,6 +272,34 @@ class CompiledModel:
             )
         self._c.cgm_advance(x, u, p, step, n)
 
+    def judge(
+        self,
+        time: np.ndarray,
+        u: np.ndarray,
+        x0: np.ndarray,
+        p: np.ndarray,
+        measured: np.ndarray,
+        weight: np.ndarray,
+        refinement: float = 1.0,
+    ) -> 'Judged':
+        """A simulation beside a record.
+
+        Args:
+            time: Stamps of the rows in s, shape (n,).
+            u: Held inputs, shape (n, nu).
+            x0: Initial state, shape (nx,).
+            p: Parameter vector, shape (np,).
+            measured: Outputs, NaN where there is no sample, shape (n, ny).
+            weight: 1 / standard deviation of each output, shape (ny,).
+            refinement: Integration steps in place of one (`_accuracy`). If more than one,
+                inputs that come late change at their instants, else a row has their mean.
+        """
+        time, u, x0, p = self._checked(time, u, x0, p)
+        measured = _shaped('measured', measured, (len(time), self.ny))
+        weight = _shaped('weight', weight, (self.ny,))
+        return Judged(self, self._late_rows(time, u, p, refinement), x0, p, measured, weight,
+                      _accuracy(refinement))  # fmt: skip
+
     def normal(
         self,
         time: np.ndarray,
@@ -285,48 +313,9 @@ class CompiledModel:
         keep: bool = False,
         refinement: float = 1.0,
     ) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
-        """Normal equations of the simulation error of one record (Eq. 4.13).
-
-        Args:
-            time: Stamps of the rows in s, shape (n,).
-            u: Held inputs, shape (n, nu).
-            x0: Initial state, shape (nx,).
-            s0: Its derivative by the columns, shape (nx, nc).
-            p: Parameter vector, shape (np,).
-            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
-            measured: Outputs, NaN where there is no sample, shape (n, ny).
-            weight: 1 / standard deviation of each output, shape (ny,).
-            keep: Return the simulated outputs and the Jacobian too.
-            refinement: Integration steps in place of one (`_accuracy`). If more than one,
-                inputs that come late change at their instants, else a row has their mean.
-        """
-        time, u, x0, p = self._checked(time, u, x0, p)
-        n, nc = len(time), np.shape(s0)[1]
-        s0 = _shaped('s0', s0, (self.nx, nc))
-        measured = _shaped('measured', measured, (n, self.ny))
-        weight = _shaped('weight', weight, (self.ny,))
-        _, output_delays, jacobian = self.delays(p)
-        rows = self._late_rows(time, u, p, refinement)
-        m = len(rows.time)
-        samples = np.full((m, self.ny), np.nan)
-        samples[rows.recorded] = measured
-        column = np.ascontiguousarray(column, dtype=np.int32)
-        if column.shape != (len(self.free),) or column.max(initial=-1) >= nc:
-            raise ValueError(f'column must place {len(self.free)} parameters below {nc}')
-        delay_columns = [_delay_column(row, column) for row in jacobian]
-        normal = Normal(np.zeros((nc, nc)), np.zeros(nc), np.zeros(self.ny), np.zeros(self.ny), 0)
-        y = np.full((m, self.ny), np.nan) if keep else None
-        j = np.zeros((m, self.ny, nc)) if keep else None
-        done = self._c.cgm_normal(
-            m, rows.time, *_accuracy(refinement), _array(rows.inputs), _array(rows.slope),
-            delay_columns[0], x0, s0, p, nc, column, samples, weight,
-            _array(output_delays), np.array(delay_columns[1:], dtype=np.int32),
-            normal.hessian, normal.gradient, normal.sse, normal.count, y, j,
-        )  # fmt: skip
-        object.__setattr__(normal, 'rows', int(np.searchsorted(rows.recorded, done)))
-        if y is None or j is None:
-            return normal, None, None
-        return normal, y[rows.recorded], j[rows.recorded]
+        """Normal equations of the simulation error of one record: `judge`, then Judged.normal."""
+        judged = self.judge(time, u, x0, p, measured, weight, refinement)
+        return judged.normal(s0, column, keep)
 
     def _checked(self, time, u, x0, p) -> tuple[np.ndarray, ...]:
         # C reads as many numbers as the model has, whatever it is handed.
@@ -337,6 +326,75 @@ class CompiledModel:
             _shaped('x0', x0, (self.nx,)),
             _shaped('p', p, (self.np,)),
         )
+
+
+class Judged:
+    """A simulation beside a record: its error at once, the derivatives when they are asked for.
+
+    Attributes:
+        sse: Weighted squared error of each output, shape (ny,).
+        count: Samples of each output, shape (ny,).
+        rows: Rows simulated before the state ran away.
+    """
+
+    def __init__(
+        self,
+        compiled: CompiledModel,
+        rows: _Rows,
+        x0: np.ndarray,
+        p: np.ndarray,
+        measured: np.ndarray,
+        weight: np.ndarray,
+        accuracy: tuple[float, float],
+    ):
+        self._compiled, self._rows, self._x0, self._p = compiled, rows, x0, p
+        self._weight, self._accuracy = weight, accuracy
+        self._samples = np.full((len(rows.time), compiled.ny), np.nan)
+        self._samples[rows.recorded] = measured
+        _, self._delays, self._delays_by = compiled.delays(p)
+        self._simulated = compiled._c.cgm_follow(
+            len(rows.time), rows.time, *accuracy, _array(rows.inputs), x0, p,
+            _array(self._delays),
+        )  # fmt: skip
+        done = len(self._simulated.outputs)
+        residual = self._simulated.outputs - self._samples[:done]
+        there = np.isfinite(residual)
+        self.sse = ((weight * np.where(there, residual, 0.0)) ** 2).sum(axis=0)
+        self.count = there.sum(axis=0).astype(float)
+        self.rows = int(np.searchsorted(rows.recorded, done))
+
+    def normal(
+        self, s0: np.ndarray, column: np.ndarray, keep: bool = False
+    ) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
+        """Normal equations of the simulation error (Eq. 4.13).
+
+        Args:
+            s0: Derivative of the initial state by the columns, shape (nx, nc).
+            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
+            keep: Return the simulated outputs and the Jacobian too.
+        """
+        compiled, rows = self._compiled, self._rows
+        nc, m, ny = np.shape(s0)[1], len(rows.time), compiled.ny
+        s0 = _shaped('s0', s0, (compiled.nx, nc))
+        column = np.ascontiguousarray(column, dtype=np.int32)
+        if column.shape != (len(compiled.free),) or column.max(initial=-1) >= nc:
+            raise ValueError(f'column must place {len(compiled.free)} parameters below {nc}')
+        first, *others = (_delay_column(row, column) for row in self._delays_by)
+        normal = Normal(np.zeros((nc, nc)), np.zeros(nc), self.sse, self.count, self.rows)
+        j = np.zeros((m, ny, nc)) if keep else None
+        done = len(self._simulated.outputs)
+        if done == m:
+            compiled._c.cgm_normal(
+                self._simulated, m, rows.time, *self._accuracy, _array(rows.inputs),
+                _array(rows.slope), first, self._x0, s0, self._p, nc, column, self._samples,
+                self._weight, _array(self._delays), np.array(others, dtype=np.int32),
+                normal.hessian, normal.gradient, j,
+            )  # fmt: skip
+        if j is None:
+            return normal, None, None
+        y = np.full((m, ny), np.nan)
+        y[:done] = self._simulated.outputs
+        return normal, y[rows.recorded], j[rows.recorded]
 
 
 def compile_model(

@@ -7,6 +7,7 @@ those of NativeRollout, arrays that are filled included.
 """
 
 import functools
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,21 @@ STATE_LIMIT = 1e6  # of any state; beyond, the motion has run away
 HALVINGS = 5  # of a step, one after the other
 STABLE = 2.5  # step times rate of decay; the method's limit is 2.785
 EASY = 0.03  # of the tolerance: a step of fourth order twice as long errs 16 times as much
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A record as a model goes along it.
+
+    Attributes:
+        outputs: At the rows before the state ran away, shape (done, ny).
+        states: Shape (n, nx), of which so many rows count.
+        steps: Of each row, for the sensitivities of NativeRollout.
+    """
+
+    outputs: np.ndarray
+    states: np.ndarray
+    steps: np.ndarray
 
 
 class InterpretedRollout:
@@ -65,10 +81,20 @@ class InterpretedRollout:
             at, late = _interpolate(time, time - delay[j], X, *ends)
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
+    def cgm_follow(self, n, time, largest, tolerance, u, x0, p, delay) -> Simulated:
+        """The states and outputs of a record, up to where the state runs away."""
+        states = np.empty((n, self.nx))
+        done = self.cgm_simulate(
+            n, np.diff(time), largest, tolerance, u, x0, p, states, 0, None
+        )  # fmt: skip
+        y = np.empty((done, self.ny))
+        self.cgm_outputs(done, time[:done], u[:done], p, states[:done], delay, y)
+        return Simulated(y, states, np.zeros((n, 0), np.int32))
+
     def cgm_normal(
-        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
-        weight, delay, delay_to, H, g, sse, count, Y, Jacobian,
-    ) -> int:  # fmt: skip
+        self, simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
+        measured, weight, delay, delay_to, H, g, Jacobian,
+    ) -> None:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
         nx, ny = self.nx, self.ny
         width = nx + self.nf + 1
@@ -112,19 +138,14 @@ class InterpretedRollout:
                 ahead = late + e * moving
                 value = np.asarray(self._h(ahead.T, u[at].T, p))[j]
                 J[:, j, delay_to[j]] -= (value - late_y[:, j]) / e
-        if Y is not None:
-            Y[:good] = y
         if Jacobian is not None:
             Jacobian[:good] = J
         there = ~np.isnan(measured)
         residual = np.where(there, y - measured, 0.0) * weight
         weighted = np.where(there[:, :, None], J, 0.0) * weight[:, None]
-        sse += (residual**2).sum(axis=0)
-        count += there.sum(axis=0)
         weighted = weighted.reshape(-1, nc)
         g += weighted.T @ residual.ravel()
         H += weighted.T @ weighted
-        return good
 
     # --- CasADi functions, built when first needed --------------------------------------------
 

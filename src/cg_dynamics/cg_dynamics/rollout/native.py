@@ -19,7 +19,14 @@ import numpy as np
 
 from cg_dynamics.assemble import Equations
 from cg_dynamics.rollout.compiler import shared_library
-from cg_dynamics.rollout.fallback import EASY, HALVINGS, STABLE, STATE_LIMIT, InterpretedRollout
+from cg_dynamics.rollout.fallback import (
+    EASY,
+    HALVINGS,
+    STABLE,
+    STATE_LIMIT,
+    InterpretedRollout,
+    Simulated,
+)
 from cg_dynamics.rollout.vector_code import (
     FLAGS,
     WIDTH,
@@ -55,14 +62,8 @@ class NativeRollout:
     def _interpreted(self) -> InterpretedRollout:
         return InterpretedRollout(self.equations, self.free)
 
-    def cgm_normal(
-        self, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
-        weight, delay, delay_to, H, g, sse, count, Y, Jacobian,
-    ) -> int:  # fmt: skip
-        """Normal equations of the simulation error (Eq. 4.13).
-
-            H (nc, nc) += sum_kj w_j^2 J'J,  g (nc) += sum_kj w_j^2 J'r,  r = y_sim - y_measured
-            sse (ny) += sum_k w_j^2 r^2,     count (ny) += samples;  NaN marks a missing sample
+    def cgm_follow(self, n, time, largest, tolerance, u, x0, p, delay) -> Simulated:
+        """The states and outputs of a record, up to where the state runs away.
 
         Args:
             n: Rows.
@@ -70,26 +71,9 @@ class NativeRollout:
             largest: Longest integration step in s.
             tolerance: Error of a step, in units of the states' scales, from which it is halved.
             u: Inputs, each held until the next row, shape (n, nu).
-            du: Their derivative by their delay, shape (n, nu).
-            delay_column: Column of that delay, or -1.
             x0: State at the first row, shape (nx,).
-            S0: Its derivative by the columns, shape (nx, nc).
             p: Parameter vector.
-            nc: Number of columns.
-            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
-            measured: Outputs, shape (n, ny).
-            weight: Of each output, shape (ny,).
             delay: Of each output in s, shape (ny,).
-            delay_to: Column of each output's delay or -1, shape (ny,).
-            H: To be added to, as g, sse and count.
-            g: Shape (nc,).
-            sse: Shape (ny,).
-            count: Shape (ny,).
-            Y: Filled with the outputs, shape (n, ny), if not None.
-            Jacobian: Filled with their derivative, shape (n, ny, nc), if not None.
-
-        Returns:
-            Number of rows before the state ran away.
         """
         states = np.empty((n, self.nx))
         rows = np.diff(time)
@@ -98,22 +82,50 @@ class NativeRollout:
         done = self.cgm_simulate(n, rows, largest, tolerance, u, x0, p, states, most, steps)
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time, u, p, states, delay, y)
-        residual = y - measured[:done]
+        return Simulated(y, states, steps)
+
+    def cgm_normal(
+        self, simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
+        measured, weight, delay, delay_to, H, g, Jacobian,
+    ) -> None:  # fmt: skip
+        """Normal equations of the simulation error (Eq. 4.13) of a record that was followed.
+
+            H (nc, nc) += sum_kj w_j^2 J'J,  g (nc) += sum_kj w_j^2 J'r,  r = y_sim - y_measured
+
+        Args:
+            simulated: What `cgm_follow` said of the same arguments.
+            n: Rows.
+            time: Their stamps in s, shape (n,).
+            largest: Longest integration step in s.
+            tolerance: As of cgm_follow.
+            u: Inputs, each held until the next row, shape (n, nu).
+            du: Their derivative by their delay, shape (n, nu).
+            delay_column: Column of that delay, or -1.
+            x0: State at the first row, shape (nx,).
+            S0: Its derivative by the columns, shape (nx, nc).
+            p: Parameter vector.
+            nc: Number of columns.
+            column: Column of each free parameter, -1 where it is held constant, shape (nf,).
+            measured: Outputs, NaN where there is no sample, shape (n, ny).
+            weight: Of each output, shape (ny,).
+            delay: Of each output in s, shape (ny,).
+            delay_to: Column of each output's delay or -1, shape (ny,).
+            H: To be added to, as g.
+            g: Shape (nc,).
+            Jacobian: Filled with the derivatives of the outputs, shape (n, ny, nc), if not None.
+        """
+        residual = simulated.outputs - measured
         there = np.isfinite(residual)
         residual = np.where(there, residual, 0.0)
-        sse += ((weight * residual) ** 2).sum(axis=0)
-        count += there.sum(axis=0)
-        if Y is not None:
-            Y[:done] = y
-        if done < n:
-            return done
+        steps = simulated.steps
         try:
             kernel = self._windows
         except UnsupportedError:
-            return self._interpreted.cgm_normal(
-                n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column, measured,
-                weight, delay, delay_to, H, g, np.zeros(self.ny), np.zeros(self.ny), Y, Jacobian,
+            self._interpreted.cgm_normal(
+                simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
+                measured, weight, delay, delay_to, H, g, Jacobian,
             )  # fmt: skip
+            return
         active = np.flatnonzero(column >= 0)
         lanes = _Lanes.of(time, float(delay.max(initial=0.0)), self.nx, len(active), delay_column)
         place = np.full(len(column), -1, np.int32)
@@ -125,8 +137,8 @@ class NativeRollout:
         by_lane = None if Jacobian is None else np.zeros((n, self.ny, k))
         if not kernel(
             lanes.first, lanes.length, lanes.start, lanes.until, lanes.handed, time, largest,
-            u, du, p, k, place, lanes.late, states, most, steps, residual, there * weight,
-            delay,
+            u, du, p, k, place, lanes.late, simulated.states, steps.shape[1], steps, residual,
+            there * weight, delay,
             np.array([own_delay.get(c, -1) for c in delay_to], np.int32), hessian, gradient,
             handed, by_lane,
         ):  # fmt: skip
@@ -148,7 +160,6 @@ class NativeRollout:
                 first = lanes.first[w]
                 judged = slice(first + lanes.start[w], first + lanes.until[w])
                 Jacobian[judged] = by_lane[judged] @ chain[w]
-        return n
 
 
 @dataclass(frozen=True)

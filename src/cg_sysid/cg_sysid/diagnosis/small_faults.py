@@ -82,12 +82,11 @@ def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:
     laws = [(name, at) for name, at in effects_on(work, o) if name in SOUND_LAWS and at in dry]
     if not laws or not o.task.bounds:
         return None
-    task = alone(work, o)
+    task = replace(alone(work, o), reach=settings.NOISE.quick)
     title = f'laws of sound machines on top of {title_of(work.added(o))}'
     looks = work.halving.screen([replace(task, effect=law) for law in laws], title)
     near = [look.task for look in looks if look.error < settings.NOISE.quick]
-    fits = [replace(task, reach=settings.NOISE.quick) for task in near]
-    found = [fit for fit in work.halving.fit(fits, title) if isinstance(fit, Outcome)]
+    found = [fit for fit in work.halving.fit(near, title) if isinstance(fit, Outcome)]
     comparison = work.selection.compare(o, found)
     law = sound_law(comparison)
     if (

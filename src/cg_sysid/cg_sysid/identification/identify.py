@@ -30,6 +30,7 @@ from cg_sysid.identification.simulation_error import (
     BARRIER,
     Point,
     Problem,
+    attempt,
     evaluate,
     moved,
     own_values,
@@ -59,6 +60,7 @@ ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may 
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
+DAMPING = 1e-3  # of the first step
 SHORT = 0.5  # damping from which a step is short
 HOPE = 10.0  # times that gain, within which it may still come there
 WHOLE = 'fitting whole records, in rounds until it settles'
@@ -93,6 +95,8 @@ class _Descent:
     point: Point | None
     converged: bool
     hopeless: bool = False
+    damping: float = DAMPING  # with which to go on
+    gained: float = np.inf  # of the cost
 
 
 def _so_far(found: _Descent) -> str:
@@ -385,11 +389,13 @@ def _descend(
         if found.hopeless:
             at_once, rounds = 0, 1
             break
+    drift, valley = (0.0, FAR) if thorough else (DRIFT, NEAR)
+    damping = DAMPING
     for k in range(rounds):
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
         found = _minimise(
-            problem, found.theta, found.motions, longest, weight, at_once,
-            0.0 if thorough else DRIFT, reach, valley=FAR if thorough else NEAR,
+            problem, found.theta, found.motions, longest, weight, at_once, drift, reach,
+            valley=valley, damping=damping,
         )  # fmt: skip
         if found.point is None:
             raise IdentificationError(
@@ -399,10 +405,12 @@ def _descend(
             )
         new = _weight(problem, found.point) if reweight else 1.0
         # A minimum under weights that are about to change is none yet.
-        converged = found.converged and bool(abs(np.log(new / weight)) < STEADY)
+        steady = bool(abs(np.log(new / weight)) < STEADY)
+        idle = not thorough and found.gained < at_once * max(SMALL_GAIN, drift * found.point.cost)
+        converged = steady and (found.converged or idle)
         if converged or found.hopeless:
             break
-        weight = new
+        weight, damping = new, found.damping if steady else DAMPING
     point = found.point
     assert point is not None
     return _End(
@@ -439,6 +447,7 @@ def _minimise(
     reach: float,
     leading: bool = False,
     valley: Valley = NEAR,
+    damping: float = DAMPING,
 ) -> _Descent:
     lower = np.array(
         [
@@ -450,7 +459,7 @@ def _minimise(
     point = evaluate(problem, theta, motions, horizon, weight)
     if point is None:
         return _Descent(theta, motions, None, False)
-    damping = 1e-3
+    began = float(point.cost)
     errors = [_error(point)]
 
     def frozen(theta, point):
@@ -464,53 +473,70 @@ def _minimise(
     barrier = max(BARRIER, CENTRAL * min(_promised(point, frozen(theta, point)), point.cost))
     point = point.beside(BARRIER, barrier)
 
+    def end(converged: bool, hopeless: bool = False) -> _Descent:
+        assert point is not None
+        there = point.beside(barrier, BARRIER)
+        return _Descent(
+            theta, motions, there, converged, hopeless, damping, began - float(there.cost)
+        )
+
     def ahead(theta, motions, point, damping):
-        """A damped Gauss-Newton step from a point: where it leads, and the point there."""
+        """Where a damped Gauss-Newton step from a point leads."""
         step, factors = _step(point, damping, frozen(theta, point))
         reached = np.clip(theta + _straight(problem, step), lower, upper)
         step = reached - theta
-        there_own = moved(problem, motions, factors, step)
-        there = evaluate(problem, reached, there_own, horizon, weight)
-        return reached, there_own, there.beside(BARRIER, barrier) if there is not None else None
+        return attempt(problem, reached, moved(problem, motions, factors, step), horizon)
+
+    def cost_of(trial):
+        """Of a trial; infinite where the simulation runs away."""
+        return np.inf if trial is None else trial.cost(weight, barrier)
+
+    def point_of(trial):
+        """Its normal equations; None where there are none."""
+        there = None if trial is None else trial.point(weight)
+        return None if there is None else there.beside(BARRIER, barrier)
 
     for _ in range(iterations):
         check_time()
         if _out_of_reach(errors, reach):
-            return _Descent(theta, motions, point.beside(barrier, BARRIER), False, hopeless=True)
-        trial_theta, trial_motions, candidate = ahead(theta, motions, point, damping)
+            return end(False, hopeless=True)
+        trial = ahead(theta, motions, point, damping)
         for _ in range(BACK if _error(point) < CLOSE else 0):
-            if candidate is None or not point.cost < candidate.cost < valley.uphill * point.cost:
+            if not point.cost < cost_of(trial) < valley.uphill * point.cost:
                 break
             # A step along a curved valley leaves its floor: back to it, across the valley.
-            back = ahead(trial_theta, trial_motions, candidate, max(valley.across, damping))
-            if back[2] is None or back[2].cost > candidate.cost:
+            uphill = point_of(trial)
+            if uphill is None:
                 break
-            trial_theta, trial_motions, candidate = back
-        if candidate is not None and candidate.cost < point.cost:
+            back = ahead(trial.theta, trial.motions, uphill, max(valley.across, damping))
+            if cost_of(back) > cost_of(trial):
+                break
+            trial = back
+        tried = cost_of(trial)
+        candidate = point_of(trial) if tried < point.cost else None
+        if candidate is not None:
             gain = point.cost - candidate.cost
-            theta, motions, point = trial_theta, trial_motions, candidate
+            theta, motions, point = trial.theta, trial.motions, candidate
             errors.append(_error(point))
             damping = max(damping / 10, 1e-9)
             small = max(drift * candidate.cost, SMALL_GAIN)
             little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
             # A short step gains little too.
             if little and _promised(point, frozen(theta, point)) < small:
-                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
+                return end(True)
             lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
             point, barrier = point.beside(barrier, lower_barrier), lower_barrier
         else:
-            if candidate is not None and candidate.cost - point.cost < 1e-9 * point.cost:
-                return _Descent(theta, motions, point.beside(barrier, BARRIER), True)
+            if point.cost <= tried < (1 + 1e-9) * point.cost:
+                return end(True)
             if damping > SHORT:
                 # Before, a step that gains nothing only says that it was too long.
                 errors.append(_error(point))
             damping *= 10
             if damping > 1e8:
                 # No step is short enough: a minimum, or a corner of what bodies can be.
-                return _Descent(
-                    theta, motions, point.beside(barrier, BARRIER), candidate is not None
-                )
-    return _Descent(theta, motions, point.beside(barrier, BARRIER), False)
+                return end(bool(point.cost <= tried < np.inf))
+    return end(False)
 
 
 def _error(point: Point) -> float:

@@ -6,6 +6,7 @@ Schur complement leaves a system as small as the number of parameters, however m
 data sets are pieces of one recording and share something of its own, they are eliminated together.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
-from cg_dynamics.rollout.compiled import CompiledModel, Normal, compile_model
+from cg_dynamics.rollout.compiled import CompiledModel, Judged, Normal, compile_model
 from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.unknowns import Unknown, awake, own_unknowns, unsettled_states
@@ -216,84 +217,34 @@ class Point:
         )
 
 
-def evaluate(
-    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
-) -> Point | None:
-    """Cost and normal equations at one point; None where the simulation runs away."""
-    k = len(theta)
-    values = problem.values(theta)
-    chain = problem.chain(values)
-    shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
-    own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-    cost = 0.0
-    border = Border(0.0, np.zeros(k), np.zeros((k, k)))
-    ny = len(problem.data_sets[0].sigma)
-    sse, count = np.zeros((len(problem.data_sets), ny)), np.zeros((len(problem.data_sets), ny))
-    if problem.consistency is not None:
-        c, jacobian = problem.consistency(values)
-        if not (c > 0).all():
-            return None
-        jacobian = jacobian * chain / c[:, None]
-        border = Border(-2 * np.log(c).sum(), -jacobian.sum(axis=0), jacobian.T @ jacobian)
-    problem.evaluations += 1
-    simulated = side_by_side(
-        lambda i: simulate_sensitive(problem, i, values, motions[i], horizon),
-        range(len(problem.data_sets)),
-    )
-    for i, (n, normal, _, _) in enumerate(simulated):
-        m2 = len(motions[i])
-        # Sensitivities can run away before the motion does.
-        if normal.rows < n or not np.abs(normal.hessian).max() < RUNAWAY:
-            return None
-        h, g = normal.hessian * weight, normal.gradient * weight
-        h[m2:] *= chain[:, None]
-        h[:, m2:] *= chain
-        g[m2:] *= chain
-        sse[i], count[i] = normal.sse, normal.count
-        spread = problem.spread(i, weight)
-        away = (motions[i] - problem.guesses[i]) / spread
-        own_h = h[:m2, :m2] + np.diag(1 / spread**2)
-        own_g = g[:m2] + away / spread
-        own[i] = own_h, h[:m2, m2:], own_g
-        shared_h += h[m2:, m2:]
-        shared_g += g[m2:]
-        cost += weight * normal.sse.sum() + away @ away
-    data_cost = cost
-    for j, u in enumerate(problem.unknowns):
-        if np.isfinite(u.tolerance):
-            away = (theta[j] - u.to_coordinate(u.prior)) / u.tolerance
-            cost += away**2
-            shared_g[j] += away / u.tolerance
-            shared_h[j, j] += 1 / u.tolerance**2
-    blocks = [_together(block, own, k) for block in problem.blocks]
-    point = Point(cost, shared_h, shared_g, blocks, sse, count, data_cost, border)
-    return point.beside(0.0, BARRIER)
+@dataclass(frozen=True)
+class Followed:
+    """One data set as the model goes along it.
 
-
-def _together(
-    block: Block, own: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]], k: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature, coupling to the k shared unknowns and gradient of a block."""
-    d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
-    for i, place in zip(block.data_sets, block.places, strict=True):
-        d[np.ix_(place, place)] += own[i][0]
-        e[place] += own[i][1]
-        g[place] += own[i][2]
-    return d, e, g
-
-
-def simulate_sensitive(
-    problem: Problem,
-    i: int,
-    values: np.ndarray,
-    motion: np.ndarray,
-    horizon: float,
-    keep: bool = False,
-) -> tuple[int, Normal, np.ndarray | None, np.ndarray | None]:
-    """One data set: rows within the horizon, normal equations and, if kept, outputs and Jacobian.
-
-    Columns: what the data set has of its own, then the shared values (not coordinates).
+    Attributes:
+        rows: Within the horizon.
+        judged: The simulation beside the record.
+        start: Derivative of the initial state by the columns, shape (nx, columns).
+        column: Of each compiled parameter.
     """
+
+    rows: int
+    judged: Judged
+    start: np.ndarray
+    column: np.ndarray
+
+    def normal(self, keep: bool = False) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
+        """Normal equations and, if kept, outputs and Jacobian.
+
+        Columns: what the data set has of its own, then the shared values (not coordinates).
+        """
+        return self.judged.normal(self.start, self.column, keep)
+
+
+def follow(
+    problem: Problem, i: int, values: np.ndarray, motion: np.ndarray, horizon: float
+) -> Followed:
+    """Data set i within the horizon."""
     data_set, compiled, u = problem.data_sets[i], problem.compiled[i], problem.inputs[i]
     p = problem.vectors[i].copy()
     p[problem.places[i]] = values
@@ -306,19 +257,143 @@ def simulate_sensitive(
     for f, column in enumerate(problem.columns[i]):
         if column >= 0:
             s0[:, column] = by_free[:, f]
-    normal, y, jacobian = compiled.normal(
-        data_set.time[:n],
-        u[:n],
-        x0,
-        s0,
-        p,
-        problem.columns[i],
-        data_set.outputs[:n],
-        1 / data_set.sigma,
-        keep=keep,
+    judged = compiled.judge(
+        data_set.time[:n], u[:n], x0, p, data_set.outputs[:n], 1 / data_set.sigma,
         refinement=problem.refinement,
-    )
-    return n, normal, y, jacobian
+    )  # fmt: skip
+    return Followed(n, judged, s0, problem.columns[i])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """All data sets simulated at one point: its cost at once, its normal equations when asked for.
+
+    A search turns half of its trials down by their cost, and the derivatives take most of the
+    time.
+
+    Attributes:
+        problem: What is minimised.
+        theta: Coordinates of the unknowns, shape (k,).
+        motions: What each data set has of its own.
+        followed: The simulations.
+        border: What keeps bodies possible there.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    followed: list[Followed]
+    border: Border
+
+    @functools.cached_property
+    def sse(self) -> np.ndarray:
+        """Squared error over noise variance of each data set and output."""
+        return np.array([followed.judged.sse for followed in self.followed])
+
+    @functools.cached_property
+    def count(self) -> np.ndarray:
+        """Samples behind it."""
+        return np.array([followed.judged.count for followed in self.followed])
+
+    def away(self, weight: float) -> list[np.ndarray]:
+        """How far what each data set has of its own is from its first guess, in spreads."""
+        return [
+            (motion - guess) / self.problem.spread(i, weight)
+            for i, (motion, guess) in enumerate(
+                zip(self.motions, self.problem.guesses, strict=True)
+            )
+        ]
+
+    def disbelief(self) -> np.ndarray:
+        """How far the unknowns are from what the model file believes, in its tolerances."""
+        return np.array([
+            (coordinate - u.to_coordinate(u.prior)) / u.tolerance
+            for coordinate, u in zip(self.theta, self.problem.unknowns, strict=True)
+        ])  # fmt: skip
+
+    def cost_of_data(self, weight: float) -> float:
+        """Of the data, and of what each data set has of its own."""
+        return float(weight * self.sse.sum() + sum(away @ away for away in self.away(weight)))
+
+    def cost(self, weight: float, barrier: float = BARRIER) -> float:
+        """Cost with so much weight of the data and of the border."""
+        disbelief = self.disbelief()
+        return float(
+            self.cost_of_data(weight) + disbelief @ disbelief + barrier * self.border.cost
+        )
+
+    def point(self, weight: float) -> Point | None:
+        """The normal equations; None where the sensitivities run away, if the motion does not."""
+        problem, k = self.problem, len(self.theta)
+        chain = problem.chain(problem.values(self.theta))
+        normals = side_by_side(lambda followed: followed.normal()[0], self.followed)
+        shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
+        own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for i, (normal, away) in enumerate(zip(normals, self.away(weight), strict=True)):
+            m2 = len(self.motions[i])
+            if not np.abs(normal.hessian).max() < RUNAWAY:
+                return None
+            h, g = normal.hessian * weight, normal.gradient * weight
+            h[m2:] *= chain[:, None]
+            h[:, m2:] *= chain
+            g[m2:] *= chain
+            spread = problem.spread(i, weight)
+            own_h = h[:m2, :m2] + np.diag(1 / spread**2)
+            own_g = g[:m2] + away / spread
+            own[i] = own_h, h[:m2, m2:], own_g
+            shared_h += h[m2:, m2:]
+            shared_g += g[m2:]
+        tolerances = np.array([u.tolerance for u in problem.unknowns])
+        shared_g += self.disbelief() / tolerances
+        shared_h += np.diag(1 / tolerances**2)
+        blocks = [_together(block, own, k) for block in problem.blocks]
+        point = Point(
+            self.cost(weight, 0.0), shared_h, shared_g, blocks, self.sse, self.count,
+            self.cost_of_data(weight), self.border,
+        )  # fmt: skip
+        return point.beside(0.0, BARRIER)
+
+
+def attempt(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float
+) -> Trial | None:
+    """All data sets simulated at one point; None where the simulation runs away."""
+    k = len(theta)
+    values = problem.values(theta)
+    border = Border(0.0, np.zeros(k), np.zeros((k, k)))
+    if problem.consistency is not None:
+        c, jacobian = problem.consistency(values)
+        if not (c > 0).all():
+            return None
+        jacobian = jacobian * problem.chain(values) / c[:, None]
+        border = Border(-2 * np.log(c).sum(), -jacobian.sum(axis=0), jacobian.T @ jacobian)
+    problem.evaluations += 1
+    followed = list(side_by_side(
+        lambda i: follow(problem, i, values, motions[i], horizon), range(len(problem.data_sets))
+    ))  # fmt: skip
+    if any(each.judged.rows < each.rows for each in followed):
+        return None
+    return Trial(problem, theta, motions, followed, border)
+
+
+def evaluate(
+    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+) -> Point | None:
+    """Cost and normal equations at one point; None where the simulation runs away."""
+    trial = attempt(problem, theta, motions, horizon)
+    return trial.point(weight) if trial is not None else None
+
+
+def _together(
+    block: Block, own: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]], k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Curvature, coupling to the k shared unknowns and gradient of a block."""
+    d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
+    for i, place in zip(block.data_sets, block.places, strict=True):
+        d[np.ix_(place, place)] += own[i][0]
+        e[place] += own[i][1]
+        g[place] += own[i][2]
+    return d, e, g
 
 
 def moved(

@@ -165,7 +165,10 @@ def fits_by_torque(
     scale: np.ndarray | None = None,
     at: Mapping[str, float] | None = None,
 ) -> list[TorqueFit]:
-    """The same for models that differ in their values only, from each; none without a record."""
+    """The same for models that differ in their values only, from each; none without a record.
+
+    Those that differ in nothing that the torques see, as in a delay, are fitted once.
+    """
     plain = [without_states(model) for model in models]
     declared = plain[0].declarations
     unknowns = [
@@ -175,10 +178,23 @@ def fits_by_torque(
     problems = problems_of(plain[0], data_sets, unknowns[0])
     if not problems:
         return []
-    return [
-        _best([problem.at(model) for problem in problems], own, scale, at or {})
-        for model, own in zip(plain, unknowns, strict=True)
-    ]
+    seen = [np.array(ca.which_depends(p.equations.imbalance, p.equations.p)) for p in problems]
+    blind = np.logical_and.reduce(
+        [~there[p.places] for p, there in zip(problems, seen, strict=True)]
+    )
+    fitted: dict[tuple, TorqueFit] = {}
+    found = []
+    for model, own in zip(plain, unknowns, strict=True):
+        from_here = [problem.at(model) for problem in problems]
+        key = tuple(x for p, there in zip(from_here, seen, strict=True) for x in p.vector[there])
+        if key not in fitted:
+            fitted[key] = _best(from_here, own, scale, at or {})
+        # What the torques do not see is left where it was.
+        left = {
+            u.name: (at or {}).get(u.name, u.prior) for u, b in zip(own, blind, strict=True) if b
+        }
+        found.append(replace(fitted[key], values={**fitted[key].values, **left}))
+    return found
 
 
 def _best(
@@ -216,12 +232,13 @@ def _descend(
     ])  # fmt: skip
     tolerance = np.array([u.tolerance for u in unknowns])
     own_scale = scale is None
-    residual, jacobian = evaluated(problems, unknowns, theta)
+    residual = residuals(problems, unknowns, theta)
     if scale is None:
         scale = spread_of(residual)
     damping, patience = DAMPING, PATIENCE
     cost = _cost(residual, scale, theta, prior, tolerance)
     for _ in range(ITERATIONS):
+        jacobian = derivatives(problems, unknowns, theta)
         weight = 1 / beyond(residual / scale)
         r = (weight * residual / scale).ravel()
         j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
@@ -234,7 +251,7 @@ def _descend(
             tried = np.array([
                 np.clip(t + s, *_range(u)) for t, s, u in zip(theta, step, unknowns, strict=True)
             ])  # fmt: skip
-            new_residual, new_jacobian = evaluated(problems, unknowns, tried)
+            new_residual = residuals(problems, unknowns, tried)
             new_cost = _cost(new_residual, scale, tried, prior, tolerance)
             better = new_cost < cost
             damping = damping / 5 if better else 5 * damping
@@ -244,7 +261,7 @@ def _descend(
         little = cost - new_cost < SETTLED * cost
         patience -= little
         settled = little and (promised < SETTLED * cost or not patience)
-        theta, residual, jacobian, cost = tried, new_residual, new_jacobian, new_cost
+        theta, residual, cost = tried, new_residual, new_cost
         if own_scale:
             scale = spread_of(residual)
             cost = _cost(residual, scale, theta, prior, tolerance)
@@ -258,12 +275,54 @@ def _descend(
     return TorqueFit(values, rms, relative, cost, len(residual), scale)
 
 
+class AlongRows:
+    """A function of (x, u, a, p) along the rows of a motion, for ever other p.
+
+    It reads and writes these arrays in place: to hand matrices over would take longer than to
+    work them out.
+    """
+
+    def __init__(self, e: Equations, motion: Motion, result: ca.SX):
+        k, m = motion.position.shape
+        every = ca.Function('along_rows', [e.x, e.u, e.acceleration, e.p], [ca.cse(result)]).map(k)
+        self._p = np.empty((k, e.p.shape[0]))
+        self._result = np.empty((k, result.shape[1], m))
+        # casadi counts by columns, so that each row here is one of its columns.
+        self._given = [
+            np.ascontiguousarray(a)
+            for a in (np.hstack([motion.position, motion.rate]), motion.inputs,
+                      motion.acceleration, self._p)
+        ]  # fmt: skip
+        self._buffer, self._run = every.buffer()
+        for i, array in enumerate(self._given):
+            self._buffer.set_arg(i, array.data)  # type: ignore[call-arg]
+        if self._result.size:
+            self._buffer.set_res(0, self._result.data)  # type: ignore[call-arg]
+
+    def __call__(self, p: np.ndarray) -> np.ndarray:
+        """Of each row, shape (k, m, columns); it holds until the next call."""
+        self._p[:] = p
+        self._run()
+        return self._result.transpose(0, 2, 1)
+
+
 @dataclass(frozen=True)
 class Problem:
-    """Motions of one set-up, and (TE) for them as a function of (x, u, a, p)."""
+    """Motions of one set-up, and (TE) along them.
+
+    Attributes:
+        equations: Of the model.
+        error: (TE), in one column.
+        slope: Its derivative by the unknowns.
+        motion: What was measured.
+        vector: Parameters.
+        places: Of the unknowns among them.
+        acted: Torque that was applied on each free coordinate, shape (k, m).
+    """
 
     equations: Equations
-    function: ca.Function
+    error: AlongRows
+    slope: AlongRows
     motion: Motion
     vector: np.ndarray
     places: list[int]
@@ -294,23 +353,14 @@ def problems_of(
             setup,
         )  # fmt: skip
         places = [e.parameter_names.index(u.name) for u in unknowns]
-        found.append(
-            Problem(
-                e, _function(e, places), every, parameter_vector(model, setup), places,
-                _acted(model, e, every),
-            )
-        )  # fmt: skip
+        moved = ca.vertcat(*(e.p[k] for k in places)) if places else ca.SX(0, 1)
+        error, slope = (
+            AlongRows(e, every, ca.densify(x))
+            for x in (e.imbalance, ca.jacobian(e.imbalance, moved))
+        )
+        vector, acted = parameter_vector(model, setup), _acted(model, e, every)
+        found.append(Problem(e, error, slope, every, vector, places, acted))
     return found
-
-
-def _function(e: Equations, places: list[int]) -> ca.Function:
-    """(TE) and its derivative by some of the parameters."""
-    moved = ca.vertcat(*(e.p[k] for k in places)) if places else ca.SX(0, 1)
-    return ca.Function(
-        'torque_error',
-        [e.x, e.u, e.acceleration, e.p],
-        [ca.cse(ca.densify(x)) for x in (e.imbalance, ca.jacobian(e.imbalance, moved))],
-    )
 
 
 def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
@@ -321,23 +371,27 @@ def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
     return motion.inputs[:, : len(rows)] @ rows @ basis
 
 
-def evaluated(
+def residuals(
     problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (rows, m) and their derivative by the coordinates (rows, m, unknowns)."""
-    residuals, jacobians = [], []
-    values = np.array([u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)])
-    slope = np.array([v if u.logarithmic else 1.0 for v, u in zip(values, unknowns, strict=True)])
-    for problem in problems:
-        p, motion = problem.vector.copy(), problem.motion
-        p[problem.places] = values
-        k, m = motion.position.shape
-        x = np.hstack([motion.position, motion.rate]).T
-        r, j = problem.function.map(k)(x, motion.inputs.T, motion.acceleration.T, p)
-        residuals.append(np.asarray(r).T)
-        by = np.asarray(j).reshape(m, k, len(unknowns)).transpose(1, 0, 2)
-        jacobians.append(by * slope)
-    return np.vstack(residuals), np.vstack(jacobians)
+) -> np.ndarray:
+    """(TE) of all rows, shape (rows, m)."""
+    return np.vstack([p.error(_parameters(p, unknowns, theta))[:, :, 0] for p in problems])
+
+
+def derivatives(
+    problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
+) -> np.ndarray:
+    """Its derivative by the coordinates of the unknowns, shape (rows, m, unknowns)."""
+    values = [u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)]
+    chain = [v if u.logarithmic else 1.0 for v, u in zip(values, unknowns, strict=True)]
+    by_value = [p.slope(_parameters(p, unknowns, theta)) for p in problems]
+    return np.vstack(by_value) * np.array(chain)
+
+
+def _parameters(problem: Problem, unknowns: Sequence[Unknown], theta: np.ndarray) -> np.ndarray:
+    p = problem.vector.copy()
+    p[problem.places] = [u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)]
+    return p
 
 
 def _range(u: Unknown) -> tuple[float, float]:

@@ -6,8 +6,8 @@ from cg_sysid.identification.simulation_error import (
     Point,
     Problem,
     evaluate,
+    follow,
     reduced,
-    simulate_sensitive,
     solve,
 )
 
@@ -149,7 +149,8 @@ def _block_scores(
     chain = problem.chain(values)
     found = []
     for i, data_set in enumerate(problem.data_sets):
-        n, _, y, jacobian = simulate_sensitive(problem, i, values, motions[i], horizon, keep=True)
+        followed = follow(problem, i, values, motions[i], horizon)
+        n, (_, y, jacobian) = followed.rows, followed.normal(keep=True)
         assert y is not None
         assert jacobian is not None
         residual = np.nan_to_num((y - data_set.outputs[:n]) / data_set.sigma**2) * weight

@@ -125,7 +125,8 @@ def scores(
     theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     tolerance = np.array([u.tolerance for u in unknowns])
-    residual, jacobian = torque_error.evaluated(problems, unknowns, theta)
+    residual = torque_error.residuals(problems, unknowns, theta)
+    jacobian = torque_error.derivatives(problems, unknowns, theta)
     # Few rows are far off, where friction turns within a window: they count less, as in fits.
     scale = torque_error.spread_of(residual) * torque_error.beyond(residual / fitted.scale)
     known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
