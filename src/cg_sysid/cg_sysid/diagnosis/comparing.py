@@ -21,13 +21,9 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
     added = work.added(base)
     key = added, bool(base.task.bounds)
     if key not in work.comparisons:
-        effects = effects_on(work, base)
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
-        said = scores(base.model, work.train, effects, base.task.bounds, work.carry_out)
-        if said is not None:
-            work.torques[key] = said
-            effects = said.worth(effects)
+        effects = worth_a_look(work, base)
         base, task = led_deeper(work, base, effects, title)
         work.under_way = base
         outcomes: list[Outcome] = []
@@ -40,6 +36,17 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
         comparison = work.selection.compare(base, outcomes)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
+
+
+def worth_a_look(work: Workspace, base: Outcome) -> Effects:
+    """What can be tried on top of a base, of a robot of many joints less what torques rule out."""
+    effects, key = effects_on(work, base), (work.added(base), bool(base.task.bounds))
+    if key not in work.torques:
+        work.torques[key] = scores(
+            base.model, work.train, effects, base.task.bounds, work.carry_out
+        )
+    said = work.torques[key]
+    return effects if said is None else said.worth(effects)
 
 
 def effects_on(work: Workspace, base: Outcome) -> Effects:

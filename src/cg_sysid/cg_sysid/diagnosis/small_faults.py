@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted
+from cg_sysid.diagnosis.comparing import alone, compare, refitted, worth_a_look
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.search import settings
@@ -78,9 +78,11 @@ def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:
 
     Then the library is not tried at all. Who imitates such a law leaves what is far from white.
     """
+    if not o.task.bounds:
+        return None
     dry = {effect.at for effect in o.model.effects if effect.friction == 'dry'}
-    laws = [(name, at) for name, at in effects_on(work, o) if name in SOUND_LAWS and at in dry]
-    if not laws or not o.task.bounds:
+    laws = [(name, at) for name, at in worth_a_look(work, o) if name in SOUND_LAWS and at in dry]
+    if not laws:
         return None
     task = replace(alone(work, o), reach=settings.NOISE.quick)
     title = f'laws of sound machines on top of {title_of(work.added(o))}'

@@ -71,7 +71,7 @@ class Workspace:
         self.halving = SuccessiveHalving(train, held, self.carry_out)
         self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         self.comparisons: dict[tuple[frozenset[str], bool], Comparison] = {}
-        self.torques: dict[tuple[frozenset[str], bool], Scores] = {}
+        self.torques: dict[tuple[frozenset[str], bool], Scores | None] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | Failure] = {}
         self.law: Outcome | None = None

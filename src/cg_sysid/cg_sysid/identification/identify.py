@@ -84,6 +84,7 @@ class Valley:
 # A long step may leap over the minima of play: only a fit that is at its end takes those that a
 # valley needs whose floor is a billionth as steep as its walls, as of a load and what carries it.
 NEAR, FAR = Valley(1e3, 1e-3), Valley(1e5, 1e-6)
+NONE = Valley(1.0, 1.0)  # of looks and short horizons, which only lead the way: no step uphill
 
 
 @dataclass(frozen=True)
@@ -381,15 +382,17 @@ def _descend(
         progress(f'fitting the first {horizon:g} s', k, len(stages) + rounds, _so_far(found))
         # The short horizons only lead the way; the belief of the file keeps them sober.
         ahead = _minimise(
-            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
-        )
+            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True,
+            valley=NONE,
+        )  # fmt: skip
         if ahead.point is not None:
             found = ahead
             weight = _weight(problem, ahead.point) if reweight else 1.0
         if found.hopeless:
             at_once, rounds = 0, 1
             break
-    drift, valley = (0.0, FAR) if thorough else (DRIFT, NEAR)
+    drift = 0.0 if thorough else DRIFT
+    valley = FAR if thorough else NONE if problem.company else NEAR
     damping = DAMPING
     for k in range(rounds):
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
