@@ -303,7 +303,7 @@ def fit(
         model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement, company
     )
     by_torque = start is None and torque_error.can(model)
-    if by_torque and at is None:
+    if by_torque and at is None and unknowns:
         found = torque_error.fit_by_torque(model, data_sets, only, bounds)
         at = found.values if found else None
     values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values

@@ -11,6 +11,7 @@ Position, rate and acceleration come from local polynomials; the torques are ave
 weights, so that both sides have seen the same window.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -126,6 +127,7 @@ def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion |
     )
 
 
+@functools.cache
 def _weights(half: int, spacing: float, order: int) -> np.ndarray:
     """Weights of samples that give a derivative at the middle of a local polynomial."""
     t = np.arange(-half, half + 1) * spacing
