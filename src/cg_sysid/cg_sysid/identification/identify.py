@@ -84,7 +84,7 @@ class Valley:
 # A long step may leap over the minima of play: only a fit that is at its end takes those that a
 # valley needs whose floor is a billionth as steep as its walls, as of a load and what carries it.
 NEAR, FAR = Valley(1e3, 1e-3), Valley(1e5, 1e-6)
-NONE = Valley(1.0, 1.0)  # of looks and short horizons, which only lead the way: no step uphill
+NONE = Valley(1.0, 1.0)  # of looks that torques have led: no step uphill
 
 
 @dataclass(frozen=True)
@@ -382,9 +382,8 @@ def _descend(
         progress(f'fitting the first {horizon:g} s', k, len(stages) + rounds, _so_far(found))
         # The short horizons only lead the way; the belief of the file keeps them sober.
         ahead = _minimise(
-            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True,
-            valley=NONE,
-        )  # fmt: skip
+            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
+        )
         if ahead.point is not None:
             found = ahead
             weight = _weight(problem, ahead.point) if reweight else 1.0
@@ -392,7 +391,8 @@ def _descend(
             at_once, rounds = 0, 1
             break
     drift = 0.0 if thorough else DRIFT
-    valley = FAR if thorough else NONE if problem.company else NEAR
+    led = problem.company and torque_error.can(problem.model)
+    valley = FAR if thorough else NONE if led else NEAR
     damping = DAMPING
     for k in range(rounds):
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
