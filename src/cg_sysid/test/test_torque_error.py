@@ -9,7 +9,7 @@ from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.diagnose import Options, diagnose
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.identification.torque_error import can, fit_by_torque
+from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque
 from cg_sysid.identification.windows import followed
 from cg_sysid.search.candidates import candidates_for
 from cg_sysid.search.torque_screening import SEEN, scores
@@ -39,6 +39,21 @@ def test_numbers_are_found_with_no_simulation(believed):
     assert (found.relative < 0.05).all()
     wrong = fit_by_torque(believed, data(true, believed), only=())
     assert (wrong.relative > 2 * found.relative).any()
+
+
+def test_starts_that_differ_in_what_torques_do_not_see_come_to_one_fit(believed):
+    data_sets = data(believed.with_values(OFF), believed)
+    delays, biases = (0.005, 0.015), (0.1, -0.3)
+    late = [believed.with_effect('actuator_delay', None, delay=d) for d in delays]
+    found = fits_by_torque(late, data_sets)
+    assert [f.values['actuator_delay.delay'] for f in found] == list(delays)
+    assert found[0].cost == found[1].cost
+    # What they do see is fitted from each start, and comes to one number.
+    pulled = [believed.with_effect('torque_bias', 'hip_joint', bias=b) for b in biases]
+    found = fits_by_torque(pulled, data_sets)
+    values = [f.values['torque_bias@hip_joint.bias'] for f in found]
+    assert values[0] != values[1]
+    assert values[0] == pytest.approx(values[1], abs=1e-2)  # N m; the costs agree to SETTLED
 
 
 def test_a_fit_by_simulation_goes_on_from_there(believed):
