@@ -53,7 +53,8 @@ def test_starts_that_differ_in_what_torques_do_not_see_come_to_one_fit(believed)
     found = fits_by_torque(pulled, data_sets)
     values = [f.values['torque_bias@hip_joint.bias'] for f in found]
     assert values[0] != values[1]
-    assert values[0] == pytest.approx(values[1], abs=1e-2)  # N m; the costs agree to SETTLED
+    # 1.2e-4 N m apart: descents end where a step promises less than SETTLED of the cost.
+    assert values[0] == pytest.approx(values[1], abs=1e-3)
 
 
 def test_a_fit_by_simulation_goes_on_from_there(believed):
