@@ -38,7 +38,7 @@ from cg_description.paths import model_path
 from cg_dynamics.cluster import ClusterError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
-from cg_dynamics.stop_request import Stopped, stopped_by_signals
+from cg_dynamics.stop_request import Stopped, raise_if_stopped, stopped_by_signals
 from cg_dynamics.watched_processes import LIMIT, WatchedProcesses
 
 GOALS = {'either': STANCES, 'inner': ('inner',), 'outer': ('outer',)}
@@ -188,6 +188,7 @@ def grow(
                 growing.count(grower.round())
                 if keeper is not None:
                     keeper.keep(Checkpoint.of(grower, **more))
+                raise_if_stopped()
     finally:
         if keeper is not None:
             keeper.write()

@@ -46,29 +46,42 @@ class Stopped(KeyboardInterrupt):
         self.status = 128 + number
 
 
+_came: list[int] = []  # signals that raised Stopped, in the contexts that are open
+
+
 @contextlib.contextmanager
 def stopped_by_signals() -> Iterator[None]:
     """In this context a signal raises Stopped, so that what the process holds is given back.
 
-    A signal may come inside a lock's own code, or in C that turns it into another error. Whatever
-    ends the context after a signal is told as the signal.
+    A signal may come inside a lock's own code, or in C that turns it into another error, or that
+    swallows it: NumPy does, where it asks an object for `__array_ufunc__`. So whatever ends the
+    context after a signal is told as the signal, its ordinary end too. Long work asks
+    `raise_if_stopped` from time to time.
     """
-    came: list[int] = []
+    earlier = len(_came)
 
     def on_signal(number: int, frame: Any) -> None:
-        came.append(number)
+        _came.append(number)
         raise Stopped(number)
 
     before = {number: signal.signal(number, on_signal) for number in _heard()}
     try:
         yield
+        raise_if_stopped()
     except Exception as error:
-        if came:
-            raise Stopped(came[0]) from error
+        if _came[earlier:]:
+            raise Stopped(_came[earlier]) from error
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        del _came[earlier:]
+
+
+def raise_if_stopped() -> None:
+    """Raise Stopped if a signal came in `stopped_by_signals` and was swallowed on its way."""
+    if _came:
+        raise Stopped(_came[0])
 
 
 def _heard() -> list[signal.Signals]:

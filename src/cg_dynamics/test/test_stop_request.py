@@ -7,9 +7,17 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cg_dynamics.stop_request import GRACE, ON_STDIN, Stopped, StopRequest, stopped_by_signals
+from cg_dynamics.stop_request import (
+    GRACE,
+    ON_STDIN,
+    Stopped,
+    StopRequest,
+    raise_if_stopped,
+    stopped_by_signals,
+)
 
 PATIENCE = 20.0  # s for the start of a Python on a busy machine
 OBEDIENT = """
@@ -166,3 +174,29 @@ def test_a_signal_can_be_an_exception():
     with pytest.raises(Stopped, match='SIGTERM'):
         wait()
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+class Curious(type):
+    """NumPy asks such a type for special methods, and swallows whatever comes meanwhile."""
+
+    def __getattr__(cls, name):
+        signal.raise_signal(signal.SIGTERM)
+        raise AttributeError(name)
+
+
+def test_a_signal_that_is_swallowed_is_told_at_the_end_and_whenever_asked():
+    went_on = []
+
+    def work(asks):
+        with stopped_by_signals():
+            np.equal(np.arange(3), Curious('One', (), {})())
+            went_on.append(asks)
+            if asks:
+                raise_if_stopped()
+                went_on.append('never')
+
+    for asks in (False, True):
+        with pytest.raises(Stopped, match='SIGTERM'):
+            work(asks)
+    assert went_on == [False, True]
+    raise_if_stopped()  # nothing is left of it
