@@ -26,8 +26,8 @@ import sys
 import time
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
+from base_parameters import least_squares
 
 from cg_description.reading import read_text
 from cg_description.robot_description import RobotDescriptionError, parse
@@ -39,7 +39,6 @@ from cg_sysid.cli.new_robot import template
 from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
-from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import fit_by_torque
@@ -85,74 +84,6 @@ def read(folder: Path, name: str, body: Urdf) -> Record:
         setup=Setup(),
         note={},
     )  # fmt: skip
-
-
-def least_squares(model: Model, train, held) -> np.ndarray:
-    """Relative residual error of each joint on held-out motions, by linear least squares."""
-    body = model.mechanism
-    n = len(body.coordinates)
-    q, v, a = (ca.SX.sym(name, n) for name in 'qva')
-    linear = _Linear(body.description, body.driven)
-    p = ca.SX.sym('p', 10 * len(linear.moving))
-    linear.numbers = p
-    torque = linear.inverse_dynamics(q, v, a, {'gravity': ca.SX(9.81)}, body.up(Setup()))
-    by = ca.Function('regressor', [q, v, a], [ca.densify(ca.jacobian(torque, p))])
-
-    def system(data_sets):
-        motions = [torque_error.motion_of(model, d, body.inputs) for d in data_sets]
-        place, rate, acceleration, acted = (
-            np.vstack([getattr(m, name) for m in motions])
-            for name in ('position', 'rate', 'acceleration', 'inputs')
-        )
-        k = len(place)
-        rigid = np.asarray(by.map(k)(place.T, rate.T, acceleration.T)).reshape(n, k, -1)
-        friction = np.zeros((n, k, 4 * n))
-        for j in range(n):
-            friction[j, :, 4 * j : 4 * j + 4] = np.column_stack(
-                [acceleration[:, j], rate[:, j], np.tanh(rate[:, j] / TURNING), np.ones(k)]
-            )
-        return np.concatenate([rigid, friction], 2).transpose(1, 0, 2), acted
-
-    design, acted = system(train)
-    size = np.maximum(np.linalg.norm(design.reshape(-1, design.shape[2]), axis=0), 1e-12)
-    solution = np.linalg.pinv(design.reshape(-1, design.shape[2]) / size, 1e-8) @ acted.ravel()
-    design, acted = system(held)
-    rest = acted - design @ (solution / size)
-    return np.sqrt((rest**2).mean(0) / (acted**2).mean(0))
-
-
-class _Linear(Urdf):
-    """The robot with masses, first moments and inertias themselves as numbers."""
-
-    numbers: ca.SX
-
-    @property
-    def _bodies(self):
-        return [_LinearBody(self.numbers[10 * k : 10 * k + 10]) for k in range(len(self.moving))]
-
-    @_bodies.setter
-    def _bodies(self, bodies):
-        self.numbers = ca.SX.zeros(10 * len(bodies))
-
-    def _determined(self):
-        return self.parameters
-
-
-class _LinearBody:
-    def __init__(self, p: ca.SX):
-        self.p = p
-
-    def parameters(self):
-        """None that has a belief."""
-        return ()
-
-    def symbols(self, _):
-        """Mass, first moment, inertia about the origin."""
-        m, hx, hy, hz, xx, yy, zz, xy, xz, yz = ca.vertsplit(self.p)
-        inertia = ca.vertcat(
-            ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz)
-        )
-        return m, ca.vertcat(hx, hy, hz), inertia
 
 
 def relative(model: Model, data_sets) -> np.ndarray:
@@ -215,7 +146,7 @@ def main() -> None:
     say('|---|' + '---|' * len(body.coordinates))
     say(_row('URDF, no friction', relative(bare(model), sets[HELD])))
     began = time.process_time()
-    squares = least_squares(model, sets[TRAIN], sets[HELD])
+    squares = least_squares(model, sets[TRAIN], sets[HELD], TURNING).left
     squares_seconds = time.process_time() - began
     say(_row('least squares', squares))
     began = time.process_time()
