@@ -1,22 +1,13 @@
 """A point mass that somebody tied on."""
 
+from dataclasses import replace
+
 import casadi as ca
 
 from cg_dynamics.effects.effect import BodyEffect
 from cg_dynamics.parameter import Parameter
 
-PLACE = tuple(
-    Parameter(
-        axis,
-        'm',
-        f'{axis} of the payload in the frame of the link',
-        -3.0,
-        3.0,
-        starts=(0.0,),
-        scale=0.05,
-    )
-    for axis in 'xyz'
-)
+SHARES = 0.3, 1.0  # of what a joint carries: masses from which an identification sets out
 
 
 class Payload(BodyEffect):
@@ -35,8 +26,21 @@ class Payload(BodyEffect):
     )  # fmt: skip
 
     def parameters_in(self, mechanism):
-        """In space its place is a point in the frame of the link."""
-        return self.parameters if mechanism.dimensions == 2 else (self.parameters[0], *PLACE)
+        """In space its place is a point in the frame of the link.
+
+        An identification sets out from loads like the link itself, at its centre of mass.
+        """
+        if mechanism.dimensions == 2:
+            return self.parameters
+        carried, centre = mechanism.carried(self.site)
+        mass = self.parameters[0]
+        if carried:
+            mass = replace(mass, starts=tuple(share * carried for share in SHARES))
+        return (mass, *(
+            Parameter(axis, 'm', f'{axis} of the payload in the frame of the link', -3.0, 3.0,
+                      starts=(at,), scale=0.05)
+            for axis, at in zip('xyz', centre, strict=True)
+        ))  # fmt: skip
 
     def energies(self, body, p):
         """Energies of the point mass."""

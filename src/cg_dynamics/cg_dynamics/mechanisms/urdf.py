@@ -341,6 +341,18 @@ class Urdf(Mechanism):
             frames[joint.child] = ca.mtimes(before, turn), at + ca.mtimes(before, origin)
         return frames
 
+    def carried(self, body: str) -> tuple[float, tuple[float, float, float]]:
+        """Mass of what moves with the joint before a body, kg, and its centre, m.
+
+        Args:
+            body: Of `bodies`; the centre is in its frame. That of a tip, which is not on the
+                joint's axis, is taken for the centre itself.
+        """
+        joint = self.moving[self.bodies.index(body)]
+        own = self._bodies[self.bodies.index(body)]
+        x, y, z = map(float, own.centre) if joint.child == body else (0.0, 0.0, 0.0)
+        return own.mass, (x, y, z)
+
     def _determined(self) -> tuple[Parameter, ...]:
         """The parameters; those that no motion of this robot shows are not free.
 

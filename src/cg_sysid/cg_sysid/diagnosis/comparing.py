@@ -43,7 +43,7 @@ def worth_a_look(work: Workspace, base: Outcome) -> Effects:
     effects, key = effects_on(work, base), (work.added(base), bool(base.task.bounds))
     if key not in work.torques:
         work.torques[key] = scores(
-            base.model, work.train, effects, base.task.bounds, work.carry_out
+            base.model, work.train, effects, base.task.bounds, work.carry_out, work.held
         )
     said = work.torques[key]
     return effects if said is None else said.worth(effects)

@@ -1,16 +1,16 @@
 """How strongly data speak for one model against another: theory.md, (EV).
 
 With chi2 the squared simulation error over noise variance, N its number of samples and N_eff the
-number of *independent* ones, a model with k parameters of its own has the evidence (in nats,
-smaller is better)
+number of *independent* ones, a model has the evidence (in nats, smaller is better)
 
     E = N_eff/2 log(chi2/N) + k/2 log(N_eff) + belief/2                              (EV)
 
 The logarithm is the Gaussian likelihood with the size of the error unknown: where a model reaches
 the noise it is the usual chi2/2, where model error dominates only ratios count. N_eff comes from
 the autocorrelation of what the best model leaves, so that a residual that is one slow wave does
-not count as ten thousand proofs. `belief` is the squared distance of the parameters from what the
-model file believes, in its own standard deviations.
+not count as ten thousand proofs. k is the number of parameters that the data determine: one that
+is known by belief counts by the share of its certainty that is not. `belief` is the squared
+distance of the parameters from what the model file believes, in its own standard deviations.
 """
 
 from collections.abc import Sequence
@@ -79,7 +79,7 @@ def independent_samples(residuals: Sequence[np.ndarray], steps: Sequence[float])
 
 
 def evidence(
-    chi2: float, samples: float, independent: float, parameters: int, belief: float
+    chi2: float, samples: float, independent: float, parameters: float, belief: float
 ) -> float:
     """(EV), in nats; smaller is better."""
     return (

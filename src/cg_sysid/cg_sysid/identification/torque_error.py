@@ -46,6 +46,7 @@ class Motion:
         rate: Shape (k, m).
         acceleration: Shape (k, m).
         inputs: Averages, shape (k, nu).
+        first: Rows with which a record begins, shape (k,).
         setup: The set-up.
     """
 
@@ -53,6 +54,7 @@ class Motion:
     rate: np.ndarray
     acceleration: np.ndarray
     inputs: np.ndarray
+    first: np.ndarray
     setup: Setup
 
 
@@ -122,9 +124,11 @@ def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion |
         columns = [np.correlate(column, weights, 'valid')[::stride] for column in values.T]
         return np.column_stack(columns)
 
+    position = over(s, place)
     return Motion(
-        over(s, place), over(s, rate), over(s, acceleration), over(inputs, place), data_set.setup
-    )
+        position, over(s, rate), over(s, acceleration), over(inputs, place),
+        np.arange(len(position)) == 0, data_set.setup,
+    )  # fmt: skip
 
 
 @functools.cache
@@ -352,7 +356,7 @@ def problems_of(
         every = Motion(
             np.vstack([m.position for m in usable]), np.vstack([m.rate for m in usable]),
             np.vstack([m.acceleration for m in usable]), np.vstack([m.inputs for m in usable]),
-            setup,
+            np.concatenate([m.first for m in usable]), setup,
         )  # fmt: skip
         places = [e.parameter_names.index(u.name) for u in unknowns]
         moved = ca.vertcat(*(e.p[k] for k in places)) if places else ca.SX(0, 1)

@@ -85,7 +85,7 @@ class Outcome:
     held: Fit
     residuals: tuple[np.ndarray, ...] = field(repr=False)
     belief: float
-    unknowns: int
+    unknowns: float
     events: Mapping[str, Mapping[str, float]]
     data_sets: tuple[tuple[str, ...], tuple[str, ...]]  # names of those trained on and held out
 
@@ -255,17 +255,15 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
         return Failure(str(error))
 
 
-def shared_unknowns(found: Fit, bounds: Bounds) -> int:
-    """Number of values that all data sets of a fit share, less small faults.
+def shared_unknowns(found: Fit, bounds: Bounds) -> float:
+    """How many of the values that all data sets share the records determine, less small faults.
 
-    And less those of which the records say nothing, as where across its plane an arm carries a
-    load: they explain nothing.
+    Each counts by the share of its certainty that comes from the records, as the well-determined
+    parameters of MacKay (Bayesian interpolation, Neural Computation 4, 1992). A load and the link
+    that carries it are known together only: what the load's numbers count the link's no longer do.
     """
-    sigmas = found.sigmas
-    return sum(
-        u.name not in bounds and not np.isinf(s)
-        for u, s in zip(found.unknowns, sigmas, strict=True)
-    )
+    shares = zip(found.unknowns, found.information, strict=True)
+    return float(sum(share for u, share in shares if u.name not in bounds))
 
 
 def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:

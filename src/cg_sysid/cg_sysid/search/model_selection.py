@@ -298,7 +298,7 @@ def above_noise(o: Outcome) -> float:
     return chi2(o) / samples(o) - 1
 
 
-def _own_values(o: Outcome) -> int:
+def _own_values(o: Outcome) -> float:
     """All that the records have of their own: initial motions, and what the effects add."""
     motions = sum(len(motion) - len(o.train.own) for motion in (*o.train.motions, *o.held.motions))
     return motions + o.unknowns - shared_unknowns(o.train, o.task.bounds)

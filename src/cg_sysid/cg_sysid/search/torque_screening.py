@@ -51,6 +51,7 @@ PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
 BLOCK = 12  # rows, 0.5 s
 QUIET = 0.9  # share of the blocks at least in which nobody pushes
 SLOW = 0.1  # of the usual rate of a joint
+BEGINS = 3  # rows, as long as the window of a local polynomial
 STANDS_OUT = 4.0  # ratio of what a push gains to what any of these blocks does
 
 
@@ -72,10 +73,10 @@ class Scores:
 
     def worth(self, candidates: Sequence[tuple[str, str | None]]) -> list[tuple[str, str | None]]:
         """Those to be looked at."""
-        best = max(self.gains.values(), default=0.0)
-        sensed = {
-            c for c in self.gains if _sensed(c[0]) and self.gains[c] > max(SEEN, NEAR * best)
-        }
+        # A sensor is judged beside sensors: laws of torque may gain by what they make of masses.
+        sensors = {c: gain for c, gain in self.gains.items() if _sensed(c[0]) and not _late(c[0])}
+        best = max(sensors.values(), default=0.0)
+        sensed = {c for c, gain in sensors.items() if gain > max(SEEN, NEAR * best)}
         ordered = sorted(self.fitted, key=lambda c: -self.fitted[c])
         best = self.fitted[ordered[0]] if ordered else 0.0
         seen = sensed | {
@@ -92,6 +93,8 @@ class Scores:
             and not _happens(name)
             and (at is None or _joint(at) in self.worst[:WORST])
         }
+        # Delays are few, and smoothed torques know little of them.
+        unseen |= {c for c in candidates if _late(c[0])}
         return [c for c in candidates if c in seen or c in unseen or c in self.pushed]
 
     def best(self) -> list[tuple[tuple[str, str | None], float]]:
@@ -106,8 +109,17 @@ def scores(
     candidates: Sequence[tuple[str, str | None]],
     bounds: Bounds,
     carry_out: CarryOut = one_by_one,
+    held: Sequence[DataSet] = (),
 ) -> Scores | None:
     """What the torques say of candidates on top of a model.
+
+    Args:
+        model: The base.
+        train: Prepared records that it is fitted to.
+        candidates: (effect, place).
+        bounds: Of small faults.
+        carry_out: Who fits.
+        held: Other records, in which somebody may have pushed as well.
 
     Returns:
         Their scores; None where torques say nothing, and of a robot of few joints, of which all
@@ -165,10 +177,10 @@ def scores(
     noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = model.mechanism.kinematics(train[0].setup).names
-    rates = np.vstack([problem.motion.rate for problem in problems])
-    error = residual / torque_error.spread_of(residual)  # a push is far off, and counts in full
+    problems = torque_error.problems_of(plain, [*train, *held], unknowns)
+    residual = torque_error.residuals(problems, unknowns, theta)
     pushers = [c for c in candidates if _happens(c[0])]
-    pushed = _pushed(model, pushers, error, _turning(rates), free)
+    pushed = _pushed(values, pushers, [p.motion for p in problems], residual, free)
     return Scores(gains, by_fit, tuple(free[k] for k in order), pushed)
 
 
@@ -187,30 +199,69 @@ def _turning(rates: np.ndarray) -> np.ndarray:
     return slow
 
 
+def _beginning(first: np.ndarray) -> np.ndarray:
+    """Rows at which the torques of a record set in: no polynomial follows the jump."""
+    begun = first.copy()
+    for _ in range(BEGINS - 1):
+        begun[1:] |= begun[:-1]
+    return begun
+
+
+def _beyond_friction(
+    model: Model, error: np.ndarray, rates: np.ndarray, free: Sequence[str]
+) -> np.ndarray:
+    """What is left of errors of torques where a joint turns around, less what friction may do.
+
+    Dry friction changes its sign there, so twice of it; where the model has none, all.
+
+    Args:
+        model: With its numbers fitted.
+        error: N m (N), (rows, m).
+        rates: (rows, m).
+        free: Names of the m coordinates.
+    """
+    allowed = np.full(len(free), np.inf)
+    for k, joint in enumerate(free):
+        sizes = [
+            abs(model.values[f'{e.label}.{e.parameters[0].name}'])
+            for e in model.effects
+            if e.friction == 'dry' and e.site == joint and e.parameters[0].unit in ('N m', 'N')
+        ]
+        if sizes:
+            allowed[k] = 2 * sum(sizes)
+    beyond = np.sign(error) * np.maximum(np.abs(error) - allowed, 0.0)
+    return np.where(_turning(rates), beyond, error)
+
+
 def _pushed(
     model: Model,
     candidates: Sequence[tuple[str, str | None]],
+    motions: Sequence[Motion],
     error: np.ndarray,
-    turning: np.ndarray,
     free: Sequence[str],
 ) -> tuple[tuple[str, str | None], ...]:
     """The pushes that are worth a fit, if any.
 
     Most blocks of rows are without one. What stands out of them as much as it does elsewhere is an
-    error of the model. That a push stands out is told by joints that do not turn around just then;
-    which link has it, by all: of those that gain as much, the one nearest to the base.
+    error of the model. That a push stands out is told by errors that are none of friction; which
+    link has it, by all: of those that gain as much, the one nearest to the base.
 
     Args:
-        model: The base.
+        model: The base, with its numbers fitted.
         candidates: Pushes, (effect, place).
-        error: Of the torques, in standard deviations, (rows, m).
-        turning: Where a joint turns around, (rows, m).
+        motions: What was measured, of as many rows together.
+        error: Of the torques, N m (N), (rows, m).
         free: Names of the m coordinates.
     """
+    rates = np.vstack([motion.rate for motion in motions])
+    first = np.concatenate([motion.first for motion in motions])
+    error = np.where(_beginning(first)[:, None], 0.0, error)
+    settled = _beyond_friction(model, error, rates, free)
+    spread = torque_error.spread_of(error)  # a push is far off, and counts in full
     about = {c: _about(model, c, free) for c in candidates}
     clear, every = (
-        {c: _gains(rows[:, joints]) for c, joints in about.items()}
-        for rows in (np.where(turning, 0.0, error), error)
+        {c: _gains((rows / spread)[:, joints]) for c, joints in about.items()}
+        for rows in (settled, error)
     )
     found = []
     for gains in clear.values():
@@ -248,6 +299,11 @@ def _gains(error: np.ndarray) -> np.ndarray:
 def _sensed(name: str) -> bool:
     """Whether an effect is one of sensors or of time, of which a torque fit does not know."""
     return LIBRARY[name].place in ('sensor', 'timing')
+
+
+def _late(name: str) -> bool:
+    """Whether an effect is one of time, as a delay."""
+    return LIBRARY[name].place == 'timing'
 
 
 def _gain_by_fit(
@@ -394,9 +450,8 @@ def _one_column(model: Model, label: str, problem: Problem, by_motion: np.ndarra
 def _rise(values: np.ndarray, motion: Motion) -> np.ndarray:
     """Derivative by time along rows, where they follow each other."""
     rise = np.gradient(values, torque_error.STRIDE_S, axis=0)
-    joins = np.abs(np.diff(motion.position, axis=0)).max(axis=1, initial=0.0)
-    usual = 20 * np.abs(motion.rate).max() * torque_error.STRIDE_S
-    rise[:-1][joins > usual] = 0.0
+    rise[motion.first] = 0.0
+    rise[:-1][motion.first[1:]] = 0.0
     return rise
 
 
