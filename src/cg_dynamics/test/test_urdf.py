@@ -8,7 +8,7 @@ from random_trees import random_tree
 from cg_description.model_file import ModelFile
 from cg_description.robot_description import parse, with_inertials
 from cg_dynamics.assemble import assemble, parameter_vector
-from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects import LIBRARY, make_effect
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import mechanism
 from cg_dynamics.mechanisms.urdf import Urdf
@@ -416,3 +416,28 @@ def test_every_effect_acts_wherever_it_says_it_can(name):
         f, p = equations(model.with_effect(name, site, **values))
         x = np.random.default_rng(1).normal(0, 0.1, f.size1_in(0))
         assert np.isfinite(np.asarray(f(x, np.ones(f.size1_in(1)), p))).all()
+
+
+def test_loads_are_sought_from_what_a_link_weighs():
+    """From the link's own centre, or from the origin of a tip, which is on no joint's axis."""
+    inertia = '<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/>'
+    link = '<link name="{}"><inertial><mass value="{}"/><origin xyz="{}"/>' + inertia
+    text = (
+        '<robot name="arm"><link name="base"/>'
+        + link.format('upper', 2.0, '0.1 0.02 -0.3') + '</inertial></link>'
+        + link.format('lower', 0.5, '0.2 0 0') + '</inertial></link>'
+        + link.format('hand', 0.3, '0 0 0.05') + '</inertial></link>'
+        '<joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>'
+        '<axis xyz="0 1 0"/></joint>'
+        '<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>'
+        '<origin xyz="0 0 -0.6"/><axis xyz="0 1 0"/></joint>'
+        '<joint name="wrist" type="fixed"><parent link="lower"/><child link="hand"/>'
+        '<origin xyz="0.4 0 0"/></joint></robot>'
+    )  # fmt: skip
+    body = Urdf(parse(text))
+    mass, *place = make_effect('payload', body, 'upper').parameters
+    assert mass.starts == pytest.approx((0.6, 2.0))
+    assert [p.starts for p in place] == [(0.1,), (0.02,), (-0.3,)]
+    mass, *place = make_effect('payload', body, 'hand').parameters
+    assert mass.starts == pytest.approx((0.24, 0.8))
+    assert [p.starts for p in place] == [(0.0,), (0.0,), (0.0,)]

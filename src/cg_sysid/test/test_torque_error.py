@@ -11,8 +11,8 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque
 from cg_sysid.identification.windows import followed
-from cg_sysid.search.candidates import candidates_for
-from cg_sysid.search.torque_screening import SEEN, scores
+from cg_sysid.search.candidates import candidates_for, shared_unknowns
+from cg_sysid.search.torque_screening import SEEN, Scores, scores
 
 OFF = {
     'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
@@ -111,6 +111,54 @@ def test_a_push_is_worth_a_look_on_the_link_that_it_is_on(believed, link):
     assert found.pushed == (('external_push', link),)
     kept = found.worth(candidates)
     assert [c for c in kept if c[0] == 'external_push'] == [('external_push', link)]
+
+
+def test_a_push_is_seen_where_its_joint_turns_around_and_in_a_record_held_out(believed):
+    true = believed.with_values(OFF)
+    sound = recorded(true, 4.0, 1)
+    at, time = sound.outputs['shank_joint_position'], sound.time
+    # An extreme in the middle of the record, not at its ends.
+    inner = np.flatnonzero((time > 1.2) & (time < 2.8))
+    turns = inner[np.argmax(np.abs(at[inner] - np.interp(time[inner], time[inner[[0, -1]]],
+                                                         at[inner[[0, -1]]])))]  # fmt: skip
+    sizes = {f'impulse_{joint}': 0.06 for joint in believed.mechanism.joints_to('shank')}
+    pushed = true.with_effect(
+        'external_push', 'shank', instant=float(time[turns]), duration=0.04, **sizes
+    )
+    hit, other = prepare(believed, [recorded(pushed, 4.0, 1), recorded(true, 4.0, 2)])
+    candidates = [('external_push', link) for link in believed.mechanism.bodies]
+    for train, held in (([hit, other], []), ([other], [hit])):
+        found = scores(believed, train, candidates, {}, held=held)
+        assert found.pushed == (('external_push', 'shank'),)
+
+
+def test_a_law_of_torque_that_gains_most_drives_out_no_delay_and_no_sensor():
+    constant, late = ('torque_constant', 'hip_joint'), ('sensor_delay', None)
+    off, bent, little = (('encoder_offset', f'{j}_position') for j in ('hip', 'thigh', 'shank'))
+    gains = {constant: 300.0, late: 0.5, off: 30.0, bent: 12.0, little: SEEN / 2}
+    found = Scores(gains, {constant: 280.0}, ('hip_joint',))
+    assert found.worth(list(gains)) == [constant, late, off]
+    # Beside a better sensor a poorer one is not worth a look; alone it is.
+    found = Scores(gains | {off: 0.0}, {constant: 280.0}, ('hip_joint',))
+    assert found.worth(list(gains)) == [constant, late, bent]
+
+
+def test_a_load_and_its_link_are_known_together_and_count_together(believed):
+    """Four numbers more, of which the records tell hardly one apart from those of the link."""
+    load = {'mass': 0.5, 'x': 0.05, 'y': 0.06, 'z': -0.2}
+    true = believed.with_values(OFF).with_effect('payload', 'shank', **load)
+    train = data(true, believed)
+    alone, loaded, pulled = (
+        fit(model, train) for model in (
+            believed, believed.with_effect('payload', 'shank'),
+            believed.with_effect('torque_bias', 'hip_joint'),
+        )
+    )  # fmt: skip
+    assert len(loaded.unknowns) == len(alone.unknowns) + 4
+    counts = [shared_unknowns(found, {}) for found in (alone, loaded, pulled)]
+    assert counts[1] - counts[0] < 1.5
+    # A torque is no body's: its number is one more.
+    assert counts[2] - counts[0] == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_sound_robot_has_little_to_look_at(believed):
