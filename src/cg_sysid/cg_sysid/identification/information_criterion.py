@@ -8,9 +8,9 @@ number of *independent* ones, a model has the evidence (in nats, smaller is bett
 The logarithm is the Gaussian likelihood with the size of the error unknown: where a model reaches
 the noise it is the usual chi2/2, where model error dominates only ratios count. N_eff comes from
 the autocorrelation of what the best model leaves, so that a residual that is one slow wave does
-not count as ten thousand proofs. k is the number of parameters that the data determine: one that
-is known by belief counts by the share of its certainty that is not. `belief` is the squared
-distance of the parameters from what the model file believes, in its own standard deviations.
+not count as ten thousand proofs. k is the number of parameters that the data determine. `belief`
+is the squared distance of the parameters from what the model file believes, in its own standard
+deviations.
 """
 
 from collections.abc import Sequence

@@ -258,12 +258,24 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
 def shared_unknowns(found: Fit, bounds: Bounds) -> float:
     """How many of the values that all data sets share the records determine, less small faults.
 
-    Each counts by the share of its certainty that comes from the records, as the well-determined
-    parameters of MacKay (Bayesian interpolation, Neural Computation 4, 1992). A load and the link
-    that carries it are known together only: what the load's numbers count the link's no longer do.
+    Not those of which they say nothing, as where across its plane an arm carries a load: they
+    explain nothing. What numbers without a belief, as those of causes, make the others unsure of,
+    these no longer tell: by so much they count less. A load and the link that carries it are known
+    together only, and count together.
     """
-    shares = zip(found.unknowns, found.information, strict=True)
-    return float(sum(share for u, share in shares if u.name not in bounds))
+    counted = np.array([u.name not in bounds for u in found.unknowns], bool)
+    counted &= ~np.isinf(found.sigmas)
+    believed = np.isfinite([u.tolerance for u in found.unknowns])
+    free, told = counted & ~believed, counted & believed
+    if not free.any() or not told.any() or not np.isfinite(found.covariance[counted]).all():
+        return float(counted.sum())
+    among, across = found.covariance[np.ix_(free, free)], found.covariance[np.ix_(told, free)]
+    variance = np.diag(found.covariance)[told]
+    less = np.einsum('ij,jk,ik->i', across, np.linalg.pinv(among, hermitian=True), across)
+    # Of the belief's own: what data say of a number is what is missing from 1.
+    belief = np.array([u.tolerance for u in found.unknowns])[told] ** 2
+    unsure, were_they_known = (np.clip(v / belief, 0, 1) for v in (variance, variance - less))
+    return float(counted.sum() - (unsure - were_they_known).sum())
 
 
 def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
