@@ -12,7 +12,7 @@ from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque
 from cg_sysid.identification.windows import followed
 from cg_sysid.search.candidates import candidates_for, shared_unknowns
-from cg_sysid.search.torque_screening import SEEN, Scores, scores
+from cg_sysid.search.torque_screening import KEPT, SEEN, Scores, scores
 
 OFF = {
     'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
@@ -138,6 +138,11 @@ def test_a_law_of_torque_that_gains_most_drives_out_no_delay_and_no_sensor():
     gains = {constant: 300.0, late: 0.5, off: 30.0, bent: 12.0, little: SEEN / 2}
     found = Scores(gains, {constant: 280.0}, ('hip_joint',))
     assert found.worth(list(gains)) == [constant, late, off]
+    # Nor does it drive out what a torque fit failed to follow, as a load and its link.
+    load = ('payload', 'shank')
+    fitted = {('torque_bias', f'joint_{k}'): 200.0 for k in range(KEPT)} | {load: -1e4}
+    found = Scores(dict.fromkeys(fitted, 20.0) | {load: 250.0}, fitted, ('hip_joint',))
+    assert load in found.worth([load])
     # Beside a better sensor a poorer one is not worth a look; alone it is.
     found = Scores(gains | {off: 0.0}, {constant: 280.0}, ('hip_joint',))
     assert found.worth(list(gains)) == [constant, late, bent]

@@ -77,14 +77,14 @@ class Scores:
         sensors = {c: gain for c, gain in self.gains.items() if _sensed(c[0]) and not _late(c[0])}
         best = max(sensors.values(), default=0.0)
         sensed = {c for c, gain in sensors.items() if gain > max(SEEN, NEAR * best)}
-        ordered = sorted(self.fitted, key=lambda c: -self.fitted[c])
-        best = self.fitted[ordered[0]] if ordered else 0.0
+        # Where numbers make up for each other a torque fit may stop in the valley, or fail.
+        promised = {c: max(gain, self.gains[c]) for c, gain in self.fitted.items()}
+        ordered = sorted(promised, key=lambda c: -promised[c])
+        best = promised[ordered[0]] if ordered else 0.0
         seen = sensed | {
             c
             for place, c in enumerate(ordered)
-            # Where numbers make up for each other a torque fit may stop in the valley.
-            if max(self.fitted[c], self.gains[c]) > SEEN
-            and (place < KEPT or self.fitted[c] > NEAR * best)
+            if promised[c] > SEEN and (place < KEPT or promised[c] > NEAR * best)
         }
         unseen = {
             (name, at)
