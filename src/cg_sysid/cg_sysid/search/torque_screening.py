@@ -177,10 +177,11 @@ def scores(
     noise = _noise(train[0], by_motion)
     order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
     free = model.mechanism.kinematics(train[0].setup).names
-    problems = torque_error.problems_of(plain, [*train, *held], unknowns)
-    residual = torque_error.residuals(problems, unknowns, theta)
-    pushers = [c for c in candidates if _happens(c[0])]
-    pushed = _pushed(values, pushers, [p.motion for p in problems], residual, free)
+    pushed: tuple[tuple[str, str | None], ...] = ()
+    if pushers := [c for c in candidates if _happens(c[0])]:
+        problems = torque_error.problems_of(plain, [*train, *held], unknowns)
+        residual = torque_error.residuals(problems, unknowns, theta)
+        pushed = _pushed(values, pushers, [p.motion for p in problems], residual, free)
     return Scores(gains, by_fit, tuple(free[k] for k in order), pushed)
 
 
