@@ -162,7 +162,7 @@ def test_a_load_and_its_link_are_known_together_and_count_together(believed):
     assert len(loaded.unknowns) == len(alone.unknowns) + 4
     counts = [shared_unknowns(found, {}) for found in (alone, loaded, pulled)]
     # Rigidly fixed, both are one body: the four tell nothing that the link's could not. A torque
-    # is no body's: its number is one more. Off by 2e-6 and 2e-5, as beliefs are not infinitely wide.
+    # is no body's: its number is one more. Off by 2e-6 and 2e-5, as beliefs have a width.
     assert counts[1] - counts[0] == pytest.approx(0.0, abs=0.01)
     assert counts[2] - counts[0] == pytest.approx(1.0, abs=0.01)
 
