@@ -62,7 +62,7 @@ from cg_interfaces.ros import (
 
 NANOSECONDS = 1_000_000_000
 RETRY = 1.0  # s between attempts to find the drive
-FIRST_WORDS = 1.0  # s that a drive that was found is given to say something
+WORDLESS = 1.0  # s that a drive may say nothing before it is looked for anew
 WITHIN = 0.0012  # s after a SYNC in which the drive answers, as a rule
 PRIORITY = -10  # niceness, where it may be had
 FAREWELL = 0.5  # s that a procedure is given to leave the drive as it was, when the node ends
@@ -118,7 +118,7 @@ class DriveNode(Node):
         self._stage, self._stopped = '', False
         self._counts: int | None = None
         self._max_torque: int | None = None  # that the drive must be given back
-        self._retry_at = self._found_at = self._next_diagnosis = 0.0
+        self._retry_at = self._heard_at = self._next_diagnosis = 0.0
         self._next_ns = 0
         self._cycles = self._answers = self._doubts = self._left_out = self._longest_ns = 0
         self._problem = 'not looked for yet'
@@ -154,7 +154,7 @@ class DriveNode(Node):
         while self.drive is not None and self.drive.answers:
             answer = self.drive.answers.popleft()
             self._answers += 1
-            self._counts = answer.counts
+            self._counts, self._heard_at = answer.counts, now
             self.out.answer(answer, self._zero_counts())
         return max(0.0, (self._next_ns - time.monotonic_ns()) / NANOSECONDS)
 
@@ -185,7 +185,7 @@ class DriveNode(Node):
             self.voltage = Reading(VOLTAGE, objects, period)
             self.temperature = Reading(s.temperature, objects, period) if s.temperature else None
         self._next_ns = time.monotonic_ns()
-        self._found_at = time.monotonic()
+        self._heard_at = time.monotonic()
 
     def _lose(self, problem: str) -> None:
         """The drive is looked for anew; until then nobody knows whether it had power."""
@@ -375,15 +375,16 @@ class DriveNode(Node):
         """A person wants torque: out of a fault as well.
 
         A drive that was switched off has lost its set-up: it is looked for anew, which takes
-        seconds; one that was found a moment ago is not given up because a person is impatient.
+        seconds and the zero with it. One that was found or heard a moment ago is not given up
+        because a person is impatient, or a host was busy.
         """
         silent = self.drive is not None and self.drive.state is None
-        fresh = self._counts is None and time.monotonic() - self._found_at < FIRST_WORDS
-        if silent and not fresh and self.procedure is None:
+        wordless = time.monotonic() - self._heard_at
+        if silent and wordless > WORDLESS and self.procedure is None:
             self._lose('the drive is silent and is looked for anew')
         problem = self._problem or self._out_of_limits()
-        if silent and fresh:
-            problem = problem or 'the drive was found a moment ago and has said nothing yet'
+        if silent:
+            problem = problem or f'the drive has said nothing for {1000 * wordless:.0f} ms'
         # A robot that is let go now would fall: a node that was killed is known for 5 s more.
         self.gate.publishers = self.commands.get_publisher_count()
         problem = problem or self.gate.rivalry
