@@ -320,7 +320,8 @@ def fit(
     end = _End.of(kept_fits.recall(place))
     if end is None:
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
-        if by_torque and evaluate(problem, theta, motions, longest, weight) is not None:
+        led = by_torque and torque_error.tells_all(model)
+        if led and evaluate(problem, theta, motions, longest, weight) is not None:
             stages = []  # the torques have led the way
         end = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
@@ -391,7 +392,7 @@ def _descend(
             at_once, rounds = 0, 1
             break
     drift = 0.0 if thorough else DRIFT
-    led = problem.company and torque_error.can(problem.model)
+    led = problem.company and torque_error.tells_all(problem.model)
     valley = FAR if thorough else NONE if led else NEAR
     damping = DAMPING
     for k in range(rounds):

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import Equations, assemble, parameter_vector
+from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.identification.data_set import DataSet
@@ -86,6 +86,14 @@ def can(model: Model) -> bool:
     """
     encoders = sum(kind == 'encoder' for kind in model.mechanism.sensor_kinds.values())
     return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
+
+
+def tells_all(model: Model) -> bool:
+    """Whether, besides, all that acts shows in the torques along the measured motion.
+
+    A rotor behind a gap or a spring moves by itself, and torques say nothing of the gap.
+    """
+    return can(model) and not any(effect.elastic for effect in acting_effects(model))
 
 
 def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion | None:
