@@ -119,7 +119,7 @@ def test_nothing_hidden_is_consistent(seed, tmp_path):
 @pytest.mark.parametrize(
     ('effect', 'programme', 'duration'),
     [
-        ('external_push', SPRINGS, DURATION),
+        pytest.param('external_push', SPRINGS, DURATION, marks=pytest.mark.evidence),
         ('friction_drift', SWINGS, SHORT),
         ('imu_drift', SWINGS, SHORT),
         ('tether_force', SPRINGS, SHORT),
@@ -140,7 +140,7 @@ def test_the_command_line_tells_of_every_kind_of_effect(effect, programme, durat
     assert (out / 'report.html').stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_small_faults_that_came_first_hide_no_second_effect(tmp_path):
     """Soft springs and a tilted sensor imitate a round foot, but for the last of it."""
     nominal = Model.load(model_path(NOMINAL_MODEL))

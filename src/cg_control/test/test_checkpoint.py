@@ -215,7 +215,7 @@ def written_anew(path, before, process) -> bytes:
     raise AssertionError(process.communicate())
 
 
-@pytest.mark.slow
+@pytest.mark.evidence
 def test_growth_that_is_killed_again_and_again_ends_as_in_one_go(robot, in_one_go, tmp_path):
     out, part = tmp_path / 'tree.npz', tmp_path / 'tree.npz.part'
     words = ['--samples', str(SAMPLES), '--seed', str(SEED), '--workers', '2', '--out', str(out)]

@@ -82,15 +82,17 @@ def nominal(model_file):
 @pytest.mark.parametrize(
     ('hidden', 'name', 'listed'),
     [
-        (Triangle, 'cogging_torque', ('torque_bias',)),
         (TenTightPlaces, 'position_dependent_friction', ('asymmetric_friction',)),
-        (ElevenTightPlaces, 'position_dependent_friction', ('torque_bias', 'cogging_torque')),
-        (StraightDrift, 'friction_drift', ('stribeck_friction',)),
         (DeadZone, 'torque_dead_zone', ('torque_saturation', 'load_dependent_friction')),
-        (FewBits, 'torque_quantisation', ('torque_constant', 'torque_dead_zone')),
         (ViscoelasticHip, 'joint_creep', ('presliding_friction', 'torque_constant')),
+        *(pytest.param(*case, marks=pytest.mark.evidence) for case in (
+            (Triangle, 'cogging_torque', ('torque_bias',)),
+            (ElevenTightPlaces, 'position_dependent_friction', ('torque_bias', 'cogging_torque')),
+            (StraightDrift, 'friction_drift', ('stribeck_friction',)),
+            (FewBits, 'torque_quantisation', ('torque_constant', 'torque_dead_zone')),
+        )),
     ],
-)
+)  # fmt: skip
 def test_a_law_of_another_shape_is_named(nominal, hidden, name, listed):
     made = records(hide(nominal, hidden))
     answer = diagnose(nominal, made, Options(effects=(name, *listed), workers=1))

@@ -90,7 +90,7 @@ NEAREST = (
     [
         ('none', None),
         ('quadratic_friction', NEAREST),
-        ('gyro_bias', NEAREST),
+        pytest.param('gyro_bias', NEAREST, marks=pytest.mark.evidence),
         pytest.param('quadratic_friction', None, marks=pytest.mark.evidence),
         pytest.param('gyro_bias', None, marks=pytest.mark.evidence),
     ],

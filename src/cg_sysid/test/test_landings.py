@@ -189,7 +189,7 @@ LUMPS = (('c1', 1.12), ('c2', 0.9), ('c4', 0.88), ('c5', 1.1))
 @pytest.mark.slow
 @pytest.mark.parametrize(
     'ground',
-    [(), pytest.param(BOUNCY, marks=pytest.mark.evidence), SLIPPERY],
+    [(), *(pytest.param(ground, marks=pytest.mark.evidence) for ground in (BOUNCY, SLIPPERY))],
     ids=['plastic', 'bouncy', 'slippery'],
 )
 def test_the_ground_is_named_in_a_robot_of_other_numbers(ground):

@@ -30,7 +30,7 @@ def test_none_of_them_is_in_the_library():
 # One law of each kind in every run; bench/evidence.py has the others.
 OTHERS = (
     'hidden_torsion_spring', 'hidden_fading', 'hidden_stop',
-    'hidden_imu_error', 'hidden_gravity_in_gyro',
+    'hidden_imu_error', 'hidden_gravity_in_gyro', 'hidden_detent',
 )  # fmt: skip
 
 
