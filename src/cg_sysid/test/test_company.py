@@ -11,7 +11,7 @@ from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.identification.simulation_error import Problem, evaluate
+from cg_sysid.identification.simulation_error import Problem, attempt
 from cg_sysid.identification.unknowns import unknowns_of
 
 SPRINGS = (
@@ -62,9 +62,9 @@ def test_the_others_change_nothing(name, effect, at):
     theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
     guesses = [data_set.motion for data_set in data_sets]
     alone, beside = (
-        evaluate(
-            Problem(model, data_sets, unknowns, guesses, company=company), theta, guesses, 9, 1
-        )
+        attempt(
+            Problem(model, data_sets, unknowns, guesses, company=company), theta, guesses, 9
+        ).point(1)
         for company in (False, True)
     )
     # The same sums in another order: of 76 cases the worst was off by 2.4e-14.

@@ -14,7 +14,7 @@ from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.identification.simulation_error import Problem, evaluate, moved, reduced
+from cg_sysid.identification.simulation_error import Problem, attempt, moved, reduced
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.report.wording import event_words
 from cg_sysid.search.candidates import Task, events_of, try_candidate
@@ -75,7 +75,7 @@ def test_eliminated_together_is_eliminated_at_once(nominal, machine):
     guesses = [np.concatenate([data_set.motion, own]) for data_set in data_sets]
     problem = Problem(model, data_sets, unknowns, guesses)
     theta = np.array([u.to_coordinate(u.prior) for u in unknowns])
-    point = evaluate(problem, theta, guesses, np.inf, 1.0)
+    point = attempt(problem, theta, guesses, np.inf).point(1.0)
     assert len(problem.blocks) == 1
     h, g, factors = reduced(point, 0.0)
     step = np.linalg.solve(h, -g)

@@ -13,7 +13,7 @@ from cg_sysid.identification.simulation_error import (
     Border,
     Point,
     Problem,
-    evaluate,
+    attempt,
     follow,
     reduced,
     solve,
@@ -47,7 +47,7 @@ def test_a_robot_without_a_border_of_consistency_has_the_curvature_of_its_sensit
     values = np.array([u.prior for u in unknowns])
     theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
     motion = problem.guesses[0]
-    point = evaluate(problem, theta, [motion], np.inf, 1.0)
+    point = attempt(problem, theta, [motion], np.inf).point(1.0)
     _, _, jacobian = follow(problem, 0, values, motion, np.inf).normal(keep=True)
     shared = jacobian[:, :, len(motion) :] / data_sets[0].sigma[:, None] * problem.chain(values)
     shared = shared.reshape(-1, len(unknowns))

@@ -30,8 +30,8 @@ from cg_sysid.identification.simulation_error import (
     BARRIER,
     Point,
     Problem,
+    Trial,
     attempt,
-    evaluate,
     moved,
     own_values,
     reduced,
@@ -95,6 +95,7 @@ class _Descent:
     motions: list[np.ndarray]
     point: Point | None
     converged: bool
+    trial: Trial | None = None  # the simulations of that point, over the horizon of the search
     hopeless: bool = False
     damping: float = DAMPING  # with which to go on
     gained: float = np.inf  # of the cost
@@ -317,22 +318,24 @@ def fit(
         behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
         thorough=thorough, reach=reach,
     )  # fmt: skip
-    end = _End.of(kept_fits.recall(place))
+    end, trial = _End.of(kept_fits.recall(place)), None
     if end is None:
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
-        led = by_torque and torque_error.tells_all(model)
-        if led and evaluate(problem, theta, motions, longest, weight) is not None:
-            stages = []  # the torques have led the way
-        end = _descend(
+        if by_torque and torque_error.tells_all(model):
+            trial = attempt(problem, theta, motions, longest)
+            if trial is not None and trial.point(weight) is not None:
+                stages = []  # the torques have led the way
+        end, trial = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
-            reach, progress,
+            reach, progress, None if stages else trial,
         )  # fmt: skip
         kept_fits.keep(place, end.numbers())
     values = problem.values(end.theta)
-    covariance, information, sigmas = (
-        uncertainty(problem, end.theta, end.motions, longest, end.weight)
-        if sure else not_asked(problem)
-    )  # fmt: skip
+    if sure:
+        trial = trial or attempt(problem, end.theta, end.motions, longest)
+        covariance, information, sigmas = uncertainty(problem, trial, end.weight)
+    else:
+        covariance, information, sigmas = not_asked(problem)
     unsettled = len(unsettled_states(model))
     values, covariance = _as_waves_are_written(model, unknowns, values, covariance)
     fitted = _with_uncertainty(model, unknowns, values, covariance)
@@ -373,10 +376,15 @@ def _descend(
     thorough: bool,
     reach: float,
     progress: Progress,
-) -> _End:
-    """From a start to the minimum: over short horizons, then the last in rounds of weights."""
+    trial: Trial | None,
+) -> tuple[_End, Trial | None]:
+    """From a start to the minimum: over short horizons, then the last in rounds of weights.
+
+    Given `trial` is the start simulated over the last horizon, where that is the only one and it
+    is known; returned are where it came to and the simulations there.
+    """
     *stages, longest = horizons
-    found = _Descent(theta, motions, None, False)
+    found = _Descent(theta, motions, None, False, trial)
     at_once = min(iterations, BETWEEN_WEIGHTS_THOROUGH if thorough else BETWEEN_WEIGHTS)
     rounds = max(1, iterations // max(1, at_once))
     for k, horizon in enumerate(stages):
@@ -386,20 +394,20 @@ def _descend(
             problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
         )
         if ahead.point is not None:
-            found = ahead
+            found = replace(ahead, trial=None)
             weight = _weight(problem, ahead.point) if reweight else 1.0
         if found.hopeless:
             at_once, rounds = 0, 1
             break
     drift = 0.0 if thorough else DRIFT
-    led = problem.company and torque_error.tells_all(problem.model)
+    led = problem.company and torque_error.can(problem.model)
     valley = FAR if thorough else NONE if led else NEAR
     damping = DAMPING
     for k in range(rounds):
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
         found = _minimise(
             problem, found.theta, found.motions, longest, weight, at_once, drift, reach,
-            valley=valley, damping=damping,
+            valley=valley, damping=damping, trial=found.trial,
         )  # fmt: skip
         if found.point is None:
             raise IdentificationError(
@@ -417,10 +425,11 @@ def _descend(
         weight, damping = new, found.damping if steady else DAMPING
     point = found.point
     assert point is not None
-    return _End(
+    end = _End(
         found.theta, found.motions, float(point.cost), point.sse, point.count, float(weight),
         converged,
     )  # fmt: skip
+    return end, found.trial
 
 
 def _guesses(
@@ -452,6 +461,7 @@ def _minimise(
     leading: bool = False,
     valley: Valley = NEAR,
     damping: float = DAMPING,
+    trial: Trial | None = None,
 ) -> _Descent:
     lower = np.array(
         [
@@ -460,7 +470,8 @@ def _minimise(
         ]
     )
     upper = np.array([u.to_coordinate(u.upper) for u in problem.unknowns])
-    point = evaluate(problem, theta, motions, horizon, weight)
+    here = trial or attempt(problem, theta, motions, horizon)
+    point = here.point(weight) if here is not None else None
     if point is None:
         return _Descent(theta, motions, None, False)
     began = float(point.cost)
@@ -481,7 +492,7 @@ def _minimise(
         assert point is not None
         there = point.beside(barrier, BARRIER)
         return _Descent(
-            theta, motions, there, converged, hopeless, damping, began - float(there.cost)
+            theta, motions, there, converged, here, hopeless, damping, began - float(there.cost)
         )
 
     def ahead(theta, motions, point, damping):
@@ -520,7 +531,7 @@ def _minimise(
         candidate = point_of(trial) if tried < point.cost else None
         if candidate is not None:
             gain = point.cost - candidate.cost
-            theta, motions, point = trial.theta, trial.motions, candidate
+            here, theta, motions, point = trial, trial.theta, trial.motions, candidate
             errors.append(_error(point))
             damping = max(damping / 10, 1e-9)
             small = max(drift * candidate.cost, SMALL_GAIN)

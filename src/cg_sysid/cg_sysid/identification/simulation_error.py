@@ -269,7 +269,7 @@ class Trial:
     """All data sets simulated at one point: its cost at once, its normal equations when asked for.
 
     A search turns half of its trials down by their cost, and the derivatives take most of the
-    time.
+    time. They are worked out once, whatever weights are asked for.
 
     Attributes:
         problem: What is minimised.
@@ -322,14 +322,18 @@ class Trial:
             self.cost_of_data(weight) + disbelief @ disbelief + barrier * self.border.cost
         )
 
+    @functools.cached_property
+    def normals(self) -> list[Normal]:
+        """Of each data set, by values and not coordinates."""
+        return list(side_by_side(lambda followed: followed.normal()[0], self.followed))
+
     def point(self, weight: float) -> Point | None:
         """The normal equations; None where the sensitivities run away, if the motion does not."""
         problem, k = self.problem, len(self.theta)
         chain = problem.chain(problem.values(self.theta))
-        normals = side_by_side(lambda followed: followed.normal()[0], self.followed)
         shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
         own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        for i, (normal, away) in enumerate(zip(normals, self.away(weight), strict=True)):
+        for i, (normal, away) in enumerate(zip(self.normals, self.away(weight), strict=True)):
             m2 = len(self.motions[i])
             if not np.abs(normal.hessian).max() < RUNAWAY:
                 return None
@@ -374,14 +378,6 @@ def attempt(
     if any(each.judged.rows < each.rows for each in followed):
         return None
     return Trial(problem, theta, motions, followed, border)
-
-
-def evaluate(
-    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
-) -> Point | None:
-    """Cost and normal equations at one point; None where the simulation runs away."""
-    trial = attempt(problem, theta, motions, horizon)
-    return trial.point(weight) if trial is not None else None
 
 
 def _together(

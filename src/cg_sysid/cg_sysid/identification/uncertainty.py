@@ -5,8 +5,7 @@ import numpy as np
 from cg_sysid.identification.simulation_error import (
     Point,
     Problem,
-    evaluate,
-    follow,
+    Trial,
     reduced,
     solve,
 )
@@ -15,9 +14,14 @@ SCORE_BLOCK = 0.25  # s; longer than most residuals are correlated
 
 
 def uncertainty(
-    problem: Problem, theta: np.ndarray, motions: list[np.ndarray], horizon: float, weight: float
+    problem: Problem, trial: Trial | None, weight: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """How sure the values are: theory.md, (COV).
+
+    Args:
+        problem: What was minimised.
+        trial: The simulations at the minimum; None where they run away.
+        weight: Of the residual in the cost.
 
     Returns:
         Covariance of the coordinates (k, k), the share of each that comes from data (k,), and
@@ -28,15 +32,14 @@ def uncertainty(
     right for white residuals, and the sandwich of scores summed over blocks longer than their
     correlation, right where the model leaves slow waves.
     """
-    point = evaluate(problem, theta, motions, horizon, weight)
-    k = len(theta)
-    if point is None:
+    point, k = trial.point(weight) if trial is not None else None, len(problem.unknowns)
+    if trial is None or point is None:
         return np.zeros((k, k)), np.zeros(k), _unknown(problem)
     excess = max(1.0, point.sse.sum() / point.count.sum())
     rescale = 1 / (excess * weight)
     if not k and not any(map(len, _unknown(problem))):
         return np.zeros((0, 0)), np.zeros(0), _unknown(problem)
-    sums = [rescale * rows for rows in _block_scores(problem, theta, motions, horizon, weight)]
+    sums = [rescale * rows for rows in _block_scores(trial, weight)]
     covariance, information = np.zeros((0, 0)), np.zeros(0)
     if k:
         covariance, information = _of_shared(problem, point, sums, rescale)
@@ -137,19 +140,14 @@ def _of_shared_alone(problem: Problem, point: Point, sums: list[np.ndarray]) -> 
     ]
 
 
-def _block_scores(
-    problem: Problem,
-    theta: np.ndarray,
-    motions: list[np.ndarray],
-    horizon: float,
-    weight: float,
-) -> list[np.ndarray]:
+def _block_scores(trial: Trial, weight: float) -> list[np.ndarray]:
     """Gradient of each data set's cost, block by block of time: its own, then what is shared."""
-    values = problem.values(theta)
-    chain = problem.chain(values)
+    problem = trial.problem
+    chain = problem.chain(problem.values(trial.theta))
     found = []
-    for i, data_set in enumerate(problem.data_sets):
-        followed = follow(problem, i, values, motions[i], horizon)
+    for data_set, motion, followed in zip(
+        problem.data_sets, trial.motions, trial.followed, strict=True
+    ):
         n, (_, y, jacobian) = followed.rows, followed.normal(keep=True)
         assert y is not None
         assert jacobian is not None
@@ -157,6 +155,6 @@ def _block_scores(
         rows = np.einsum('kj,kjc->kc', residual, jacobian)
         edges = np.arange(0, n, max(1, int(n * SCORE_BLOCK / max(data_set.time[n - 1], 1e-9))))
         sums = np.add.reduceat(rows, edges, axis=0)
-        sums[:, len(motions[i]) :] *= chain
+        sums[:, len(motion) :] *= chain
         found.append(sums)
     return found

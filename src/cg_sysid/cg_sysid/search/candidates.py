@@ -312,7 +312,7 @@ def _unseen_shapes(found: Fit) -> tuple[str, ...]:
 
 def cost_of(task: Task) -> int:
     """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
-    effect = _tried(task)
+    effect = effect_of(task)
     assert effect is not None
     swept = any(p.swept for p in effect.parameters)
     return 100 * eventful(task) + 10 * bool(effect.states) + 10 * swept + len(starts_of(effect))
@@ -358,7 +358,7 @@ def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
 
 def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     model, warm_starts = next(_starting_models(task)), task.warm_starts
-    effect = _tried(task)
+    effect = effect_of(task)
     if not warm_starts and effect and len(starts_of(effect)) > 1:
         warm_starts = _first_seconds(task, train)
     if not warm_starts:
@@ -401,8 +401,8 @@ def _whole(
     )  # fmt: skip
 
 
-def _tried(task: Task) -> Effect | None:
-    """The effect that is tried."""
+def effect_of(task: Task) -> Effect | None:
+    """The effect that a task tries; None of a base alone."""
     if task.effect is None:
         return None
     name, at = task.effect
@@ -411,7 +411,7 @@ def _tried(task: Task) -> Effect | None:
 
 def _declared(task: Task) -> tuple[Parameter, ...]:
     """Parameters of the effect that is tried."""
-    effect = _tried(task)
+    effect = effect_of(task)
     return effect.parameters if effect else ()
 
 
@@ -653,7 +653,7 @@ def _starting_models(task: Task):
 
 
 def _label(task: Task) -> str:
-    effect = _tried(task)
+    effect = effect_of(task)
     return effect.label if effect else task.model.name
 
 

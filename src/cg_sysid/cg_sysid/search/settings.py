@@ -99,6 +99,7 @@ class Halving:
         favoured: Times what the best first look leaves above the noise, to be fitted first.
         mostly: An error that is so many times smaller is mostly explained.
         idle: Share of what the best explains: who explains less is idle beside it.
+        belief: Times what beliefs cost the base, that a fit that is not at its end may be off.
         heavy: Cost from which a candidate is looked at when the others have been.
         first_few: Light candidates that may show that the base was in a local minimum.
         fewest: Candidates that are fitted to whole records whatever the first look says.
@@ -112,6 +113,7 @@ class Halving:
     favoured: float = 2.0
     mostly: float = 3.0
     idle: float = 0.3
+    belief: float = 3.0
     heavy: int = 10
     first_few: int = 8
     fewest: int = 5

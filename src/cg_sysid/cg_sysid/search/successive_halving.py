@@ -31,6 +31,7 @@ from cg_sysid.search.candidates import (
     chi2,
     cost_of,
     deeper,
+    effect_of,
     eventful,
     led_on,
     screen,
@@ -123,6 +124,14 @@ class SuccessiveHalving:
         tasks = _on_top(base, effects)
         events = [task for task in tasks if eventful(task)]
         others = [task for task in tasks if not eventful(task)]
+        aside: list[str] = []
+        if by_belief:
+            # A rotor that moves by itself and leaves no error cannot be told from one that does
+            # not (Effect.without_states).
+            acting = [effect for task in others if (effect := effect_of(task)) is not None]
+            aside = [effect.label for effect in acting if effect.elastic]
+            others = [task for task, effect in zip(others, acting, strict=True)
+                      if not effect.elastic]  # fmt: skip
         looking = f'first look at {what}'
         screenings = self.screen(_light(others), looking)
         found: dict[str, Outcome] = {}
@@ -134,18 +143,20 @@ class SuccessiveHalving:
             settings.HALVING.as_good * beaten,
         )
         reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
+        if by_belief:
+            reach = min(reach, _at_stake(base.first))
         heavy = [replace(t, reach=reach) for t in others if _is_heavy(t)]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
-            limit = settings.HALVING.near * _smallest(screenings)
+            limit = min(settings.HALVING.near * _smallest(screenings), _at_stake(base.first))
             heat = [screening for screening in screenings if not screening.error > limit]
             tried.update(screening.label for screening in heat)
-            most = settings.HALVING.rungs[-1]
-            tasks = [replace(screening.task, iterations=most) for screening in heat]
+            most, reach = settings.HALVING.rungs[-1], _at_stake(base.base)
+            tasks = [replace(screening.task, iterations=most, reach=reach) for screening in heat]
             return list(self._fitted(tasks, what).values()), [
-                screening.label for screening in screenings if screening.label not in tried
-            ]
+                *aside, *(s.label for s in screenings if s.label not in tried),
+            ]  # fmt: skip
         favoured = _favoured(_smallest(screenings))
         for limit, of_heavy in itertools.product((favoured, np.inf), (False, True)):
             best = _best(found)
@@ -334,6 +345,16 @@ def worth_having(best: float, base: Fit | None) -> float:
     """
     error = _error(base)
     return error - settings.HALVING.idle * (error - best) if best < error < np.inf else error
+
+
+def _at_stake(base: Fit | None) -> float:
+    """chi2/N up to which a fit may cost more error than a base, as numbers nobody believes do.
+
+    What beliefs can gain is no more than what they cost the base.
+    """
+    if base is None:
+        return np.inf
+    return base.normalised_error + settings.HALVING.belief * base.belief / float(base.count.sum())
 
 
 def _clear(best: float, first: Fit | None) -> float:
