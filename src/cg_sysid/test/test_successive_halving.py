@@ -197,3 +197,22 @@ def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):
     assert worth_having(1.06, leaving) == worth_having(np.inf, leaving) == pytest.approx(1.06)
     assert worth_having(1.01, leaving) == pytest.approx(1.06 - 0.05 * settings.HALVING.idle)
     assert worth_having(1.01, None) == np.inf
+
+
+def test_no_rotor_is_sought_where_only_beliefs_speak(nominal):
+    train, held = ([data_set] for data_set in _data_sets(nominal, nominal, seconds=2.0))
+    asked = []
+
+    def carry_out(function, arguments, what):
+        arguments = list(arguments)
+        asked.extend(task.effect for task, *_ in arguments if isinstance(task, Task))
+        return [function(*each) for each in arguments]
+
+    found = fit(nominal, train)
+    base = Task(nominal, base=found, first=found)
+    effects = [('torque_bias', None), ('joint_flexibility', None), ('backlash', None)]
+    halving = SuccessiveHalving(train, held, carry_out)
+    outcomes, aside = halving.run(base, effects, 'effects', by_belief=True)
+    assert {outcome.label for outcome in outcomes} == {'torque_bias'}
+    assert set(asked) == {('torque_bias', None)}
+    assert set(aside) == {'joint_flexibility', 'backlash'}

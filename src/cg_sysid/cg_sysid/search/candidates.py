@@ -566,6 +566,8 @@ def _all_screened(
     if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
         heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
         ahead = heats[: settings.SCREENING.followed]
+        if ahead[0][0].normalised_error > settings.SCREENING.hopeless * task.reach:
+            return [(found, model.with_values(_numbers(found))) for found, model in ahead]
         led = [((model, heat), None) for heat, model in ahead]
     return [
         (found, model.with_values(_numbers(found)))

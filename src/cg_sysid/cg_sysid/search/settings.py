@@ -18,6 +18,7 @@ class Screening:
         fewest_records: Short records from each set-up, at least.
         iterations: Of a first look.
         heat: Of these, those that all starts of a candidate are given.
+        hopeless: Times the error that matters, beyond which a candidate is given no more of them.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.
         following: Iterations of each of these on whole records, before the best of them is chosen.
@@ -30,6 +31,7 @@ class Screening:
     fewest_records: int = 6
     iterations: int = 16
     heat: int = 3
+    hopeless: float = 100.0
     most_starts: int = 24
     followed: int = 3
     following: int = 8
