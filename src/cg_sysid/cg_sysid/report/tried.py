@@ -49,7 +49,7 @@ def _round(k: int, r: Facts, causes: dict[str, set[str]]) -> Markup:
             tag('details', tag('summary', f'{len(rest)} more candidates'),
                 wide(f'More candidates of round {k}', _ranking(rest, taken, rivals, strongest)))
             if rest else None,
-            tag('p', 'Ruled out by the first seconds of the records: ',
+            tag('p', 'Not fitted to whole records: ',
                 ', '.join(effect_name(label) for label in r['set_aside']), class_='small')
             if r['set_aside'] else None,
             open=k == 1),

@@ -36,7 +36,7 @@ class Comparison:
         ranked: Each candidate and the outcome of its fit.
         independent: Independent samples behind the evidence.
         margin: Evidence in nats by which rivals are not told apart.
-        aside: Labels of those that a first look set aside.
+        aside: Labels of those that were not fitted to whole records.
     """
 
     base: Outcome

@@ -119,7 +119,7 @@ class SuccessiveHalving:
                 not tell candidates apart, and all that come near are fitted to whole records.
 
         Returns:
-            Outcomes of fits to whole records, and labels of those that were not worth one.
+            Outcomes of fits to whole records, and labels of others that were not worth one.
         """
         tasks = _on_top(base, effects)
         events = [task for task in tasks if eventful(task)]
