@@ -379,7 +379,7 @@ def main() -> int:
     parser.add_argument('--sample', type=int, help='so many of all cases')
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='cases side by side')
     parser.add_argument('--limit', type=float, default=LIMIT, help=f'CPU s a case [{LIMIT:g}]')
-    parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'robots.jsonl')
+    parser.add_argument('--raw', type=Path, default=ROOT / 'bench/results/robots.jsonl')
     parser.add_argument('--write', type=Path)
     parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     options = parser.parse_args()

@@ -2,7 +2,7 @@
 
     tools/setup.sh bench                                                # mujoco.sysid
     ./cg exec python bench/robots_peers.py [--toolbox 'arm2:*'] [--seconds 300]
-        [--ours build/robots.jsonl] [--write FILE]
+        [--ours bench/results/robots.jsonl] [--write FILE]
 
 All get the URDF as its owner has it, and the same bags. The peers fit the records that the
 diagnosis fits, cut into the same windows, and are judged by those that it holds out:
@@ -410,7 +410,7 @@ def main() -> int:
     parser.add_argument('--seconds', type=float, default=SECONDS,
                         help=f'of CPU time, for mujoco.sysid [{SECONDS:g}]')  # fmt: skip
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='cases side by side')
-    parser.add_argument('--ours', type=Path, default=ROOT / 'build' / 'robots.jsonl')
+    parser.add_argument('--ours', type=Path, default=ROOT / 'bench/results/robots.jsonl')
     parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'robots_peers.jsonl')
     parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     parser.add_argument('--write', type=Path)
