@@ -92,7 +92,7 @@ def torqued(robot, person):
     return report
 
 
-ALWAYS = 'imu_unplugged', 'drive_killed'
+ALWAYS = 'drive_fault', 'imu_unplugged', 'drive_killed', 'balance_killed'
 
 
 @pytest.mark.parametrize('fault', [
