@@ -1,6 +1,6 @@
 """Faults of a robot on wires, seen from its drive: how long torque acts, and that it stays off.
 
-    ./cg exec python bench/wires_faults.py [--times 100] [--only NAME ...] [--seed 1] [--write]
+    ./cg exec python bench/wires_faults.py [--times 100] [--only NAME ...] [--rate 500] [--write]
     ./cg exec python bench/wires_faults.py --table-only --write
 
 One robot serves many trials: a person brings it back (wires_rig.py), and what cannot be brought
@@ -18,7 +18,8 @@ than 10 ms says nothing: its line says so, and it is done again, with other draw
 
 `--first` gives robot and devices real-time priority, for a host that has other work. Where they
 need most of all processors it does harm: Linux lets real-time work have 95 % of a second, and then
-stops it. Trials with and without it are kept apart.
+stops it. `--rate` is that of the robot's loop: a host whose processors cannot carry 500 Hz loses
+the robot with nothing done to it. What was run in another way is kept apart.
 """
 
 import argparse
@@ -149,9 +150,9 @@ def is_right(fault: Fault, row: dict[str, Any]) -> bool:
 
 
 def campaign(
-    faults: list[Fault], times: int, seed: int, first: bool, done: set[tuple[str, int]]
+    faults: list[Fault], times: int, seed: int, done: set[tuple[str, int]], **how: Any
 ) -> Iterator[dict[str, Any]]:
-    """Rows as they come."""
+    """Rows as they come; `how` the robot is run is told to the rig."""
     for setup, prepare in SETUPS.items():
         missing = [
             (fault, k) for k in range(times) for fault in faults
@@ -159,7 +160,7 @@ def campaign(
         ]  # fmt: skip
         if missing:
             with prepare() as needs:
-                yield from served(missing, seed, first, needs)
+                yield from served(missing, seed, how | needs)
 
 
 def share(fault: Fault, times: int) -> int:
@@ -168,7 +169,7 @@ def share(fault: Fault, times: int) -> int:
 
 
 def served(
-    missing: list[tuple[Fault, int]], seed: int, first: bool, needs: dict[str, Any]
+    missing: list[tuple[Fault, int]], seed: int, needs: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Trials by one robot, or as many as it takes."""
     with ExitStack() as stack:
@@ -181,7 +182,7 @@ def served(
                 try:
                     if it is None:
                         devices = random.randrange(1 << 30)
-                        it = stack.enter_context(rig(LOG, devices, first, **needs))
+                        it = stack.enter_context(rig(LOG, devices, **needs))
                         row['robots'] = 1
                         began = time.monotonic()
                     with it.devices_first() if fault.crowds else nullcontext():
@@ -200,8 +201,8 @@ def served(
                     break
 
 
-def version_of_sources(first: bool) -> str:
-    """A hash of all sources that a trial depends on."""
+def version_of_sources(first: bool, rate: float) -> str:
+    """A hash of all sources that a trial depends on, and how the robot is run."""
     files = [
         *(f for p in SOURCES for f in ROOT.glob(f'src/cg_{p}/cg_{p}/**/*.py')),
         *ROOT.glob('src/cg_description/models/*.yaml'),
@@ -210,7 +211,7 @@ def version_of_sources(first: bool) -> str:
     digest = hashlib.sha256()
     for file in sorted(files):
         digest.update(str(file.relative_to(ROOT)).encode() + file.read_bytes())
-    return digest.hexdigest()[:12] + ('-first' if first else '')
+    return f'{digest.hexdigest()[:12]}-{rate:g}Hz{"-first" * first}'
 
 
 def known_rows(raw: Path, version: str | None, seed: int | None) -> list[dict[str, Any]]:
@@ -320,14 +321,16 @@ def text_of(rows: list[dict[str, Any]]) -> str:
                for why in ('held up', 'no torque', 'lost')}  # fmt: skip
     version, seed = rows[-1]['version'], rows[-1]['seed']
     first = version.endswith('-first')
+    rate = rows[-1].get('rate', 500.0)
     priority = ' Robot and devices had real-time priority on a host with other work.' * first
     times = rows[-1]['times']
     hours = sum(row['took_s'] for row in rows) / 3600
     return '\n'.join([
         '# Faults of a robot on wires', '',
         f'Command: `./cg exec python bench/wires_faults.py --times {times}'
-        f' --seed {seed}{" --first" * first}`; this page: the same with `--table-only --write`. '
-        f'Sources {version}. Drive, IMU and body are emulated in another process.{priority}', '',
+        f' --seed {seed} --rate {rate:g}{" --first" * first}`; this page: the same with `--table-only --write`. '
+        f'Sources {version}. The loop of the robot runs at {rate:g} Hz. Drive, IMU and body are '
+        f'emulated in another process.{priority}', '',
         f'{len(rows) - len(thrown)} trials in {hours:.1f} h. Thrown away: {reasons["held up"]} in '
         f'which the host held the emulation up by more than {1e3 * HELD_UP:.0f} ms, '
         f'{reasons["no torque"]} without torque at the instant of the fault, {reasons["lost"]} in '
@@ -342,11 +345,12 @@ def main() -> int:
     parser.add_argument('--only', nargs='*', default=[], help='classes whose names hold this')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--first', action='store_true', help='with real-time priority')
+    parser.add_argument('--rate', type=float, default=500.0, help='of the loop, Hz [500]')
     parser.add_argument('--raw', type=Path, default=RAW)
     parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     parser.add_argument('--write', action='store_true', help='store the table')
     options = parser.parse_args()
-    version = version_of_sources(options.first)
+    version = version_of_sources(options.first, options.rate)
     faults = [
         f for f in FAULTS.values()
         if not options.only or any(words in f.name for words in options.only)
@@ -355,8 +359,9 @@ def main() -> int:
     if not options.table_only:
         done = {(row['class'], row['trial']) for row in rows if row['counts']}
         options.raw.parent.mkdir(parents=True, exist_ok=True)
-        for row in campaign(faults, options.times, options.seed, options.first, done):
-            row |= {'version': version, 'seed': options.seed, 'times': options.times}
+        how = {'first': options.first, 'rate': options.rate}
+        for row in campaign(faults, options.times, options.seed, done, **how):
+            row |= {'version': version, 'seed': options.seed, 'times': options.times, **how}
             rows.append(row)
             with options.raw.open('a') as raw:
                 raw.write(json.dumps(row) + '\n')

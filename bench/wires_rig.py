@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -313,6 +314,7 @@ def rig(
     change: Callable[[dict[str, NodeOf]], None] = lambda nodes: None,
     begin: Callable[['Rig'], object] = lambda rig: None,
     words: tuple[str, ...] = (),
+    rate: float = 500.0,
 ) -> Iterator[Rig]:
     """A robot that stands.
 
@@ -323,6 +325,7 @@ def rig(
         begin: What else must be there for the robot to stand.
         words: More arguments of the emulation.
         first: Real-time priority, so that what others do on this machine hardly counts.
+        rate: Of the robot's loop, in Hz.
 
     Raises:
         Lost: It does not stand.
@@ -332,7 +335,7 @@ def rig(
         log.parent.mkdir(parents=True, exist_ok=True)
         output: IO[str] = stack.enter_context(log.open('a'))
         stack.enter_context(own_domain())
-        nodes = robot_nodes(options_in(folder))
+        nodes = robot_nodes(replace(options_in(folder), rate=rate))
         change(nodes)
         state = *map(str, START), '0', '0'
         robot = Emulated(folder, '--state', *state, '--seed', str(seed), *words)

@@ -24,8 +24,9 @@ from cg_dynamics.stop_request import Stopped
 from cg_hardware.drive.settings import read_settings
 from cg_interfaces import topics
 
-RATE_HZ = 500.0
-STALE = 0.015  # s: with a cycle of the drive, torque is zero 20 ms after the last command
+RATES = 200.0, 1000.0  # Hz: at less, a command that comes a cycle late would count as lost
+OFF = 0.020  # s after the last command, at which the torque is zero
+SLACK = 0.003  # s of them that the drive node may be late
 MISSING = 0.1  # s without requests after which a person must look; busy hosts miss 30 ms
 BLIND = 0.02  # s without the encoder
 OWNERS = 'balance', 'experimenter'  # whom the gate may listen to
@@ -43,6 +44,7 @@ class RobotOptions:
     """What the launch file is told.
 
     Attributes:
+        rate: Of measurements, commands and the drive's cycles, in Hz.
         imu: Serial line of the IMU.
         baud: Of it, bit/s.
         axis: Angle of the IMU that is the lean: roll, pitch or yaw.
@@ -62,6 +64,7 @@ class RobotOptions:
         epsilon: Of the observer, s.
     """
 
+    rate: float = 500.0
     imu: str = '/dev/ttyACM0'
     baud: int = 921_600
     axis: str = 'pitch'
@@ -90,21 +93,28 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
     """Node name -> what to start, in the order of ending.
 
     Raises:
-        ValueError: The file of the drive's settings cannot be used.
+        ValueError: The file of the drive's settings or the rate cannot be used.
     """
+    slowest, fastest = RATES
+    if not slowest <= options.rate <= fastest:
+        raise ValueError(
+            f'rate is {options.rate:g} Hz; allowed is {slowest:g} to {fastest:g}: the torque must '
+            f'be zero {1e3 * OFF:g} ms after the last command'
+        )
+    rate = {'sample_rate_hz': options.rate}
     more = read_settings(options.drive_settings) if options.drive_settings else {}
-    gate = {'torque_limit': options.torque_limit, 'sample_rate_hz': RATE_HZ}
-    model = {'model_file': options.model, 'sample_rate_hz': RATE_HZ}
+    gate = rate | {'torque_limit': options.torque_limit}
+    model = rate | {'model_file': options.model}
     return {
         'drive': NodeOf('cg_hardware', 'drive_node', gate | {
-            'stale_after': STALE, 'driver': options.driver, 'interface': options.interface,
-            'channel': options.channel, 'node_id': options.drive, 'sign': options.drive_sign,
-            'gear': options.gear, 'counts_per_turn': options.counts_per_turn,
-            'zero_file': options.drive_zero_file,
+            'stale_after': OFF - SLACK - 1 / options.rate, 'driver': options.driver,
+            'interface': options.interface, 'channel': options.channel, 'node_id': options.drive,
+            'sign': options.drive_sign, 'gear': options.gear,
+            'counts_per_turn': options.counts_per_turn, 'zero_file': options.drive_zero_file,
         } | more),
         'imu': NodeOf('cg_hardware', 'imu_node', {
-            'port': options.imu, 'baud': options.baud, 'rate_hz': RATE_HZ, 'axis': options.axis,
-            'sign': options.imu_sign, 'zero_file': options.zero_file,
+            'port': options.imu, 'baud': options.baud, 'rate_hz': options.rate,
+            'axis': options.axis, 'sign': options.imu_sign, 'zero_file': options.zero_file,
         }),
         'balance': NodeOf('cg_control', 'balance_node', model, asks_as('balance')),
         'safety_gate': NodeOf('cg_hardware', 'safety_gate_node', gate | {
@@ -118,6 +128,7 @@ def robot_nodes(options: RobotOptions) -> dict[str, NodeOf]:
 
 
 TOLD = {
+    'rate': 'of measurements, commands and the cycles of the drive, Hz',
     'imu': 'serial line of the IMU',
     'baud': 'of it, bit/s',
     'axis': 'angle of the IMU that is the lean: roll, pitch or yaw',

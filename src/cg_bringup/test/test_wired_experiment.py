@@ -8,12 +8,16 @@ import pytest
 from robot_in_memory import RobotInMemory
 
 from cg_bringup import experiment, operating
+from cg_bringup.robot_run import RobotOptions, robot_nodes
 from cg_bringup.runs import WIRED, Run, experiment_nodes
 from cg_bringup.wired_experiment import EXPERIMENTER, WiredExperiment, carry_out, pose_in_words
 from cg_description.paths import model_path
 from cg_hardware.checklist.robot import Refused
 from cg_interfaces import topics
 from cg_sysid.experiments.catalogue import ExperimentError, experiment_names, load_experiment
+from cg_sysid.experiments.synthetic import Synthesis, synthesise
+from cg_sysid.records.alignment import to_record
+from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.records.bags import parse_note
 
 MODEL = model_path('compass_gait_mit')
@@ -147,6 +151,31 @@ def test_the_wired_robot_is_a_machine_like_the_simulated_one(tmp_path):
     assert load_experiment(told.experiment) == run.experiment
     with pytest.raises(ExperimentError, match='lockstep, real_time, wired'):
         Run(load_experiment('chirp'), tmp_path / 'bag', mode='simulated')
+
+
+def test_another_rate_leaves_the_torque_as_short_a_time():
+    for rate in (500.0, 250.0):
+        nodes = robot_nodes(RobotOptions(rate=rate))
+        told = {name: nodes[name].parameters['sample_rate_hz'] for name in nodes if name != 'imu'}
+        assert {nodes['imu'].parameters['rate_hz'], *told.values()} == {rate}
+        stale = nodes['drive'].parameters['stale_after']
+        assert 2 / rate < stale <= 0.02 - 1 / rate
+    with pytest.raises(ValueError, match='rate is 50 Hz; allowed is 200 to 1000'):
+        robot_nodes(RobotOptions(rate=50.0))
+
+
+@pytest.mark.parametrize(('rate', 'complete'), [(250.0, True), (500.0, True), (200.0, False)])
+def test_samples_are_counted_by_the_rate_that_the_robot_ran_at(tmp_path, rate, complete):
+    run = Run(load_experiment('chirp'), tmp_path / 'bag', mode=WIRED, duration=2.0)
+    raw = synthesise(Synthesis(duration=2.0, rate=rate), seed=3)
+    if not complete:
+        raw.note['nominal_rate_hz'] = 250.0
+    write_bag(run.bag, to_record(raw))
+    if complete:
+        assert experiment.check_counts(run)[topics.IMU] == 2 * rate
+        return
+    with pytest.raises(ExperimentError, match=r'400 messages of .*, expected 475'):
+        experiment.check_counts(run)
 
 
 def test_the_person_hears_the_operator_and_not_the_log(tmp_path, capsys):
