@@ -328,9 +328,9 @@ def text_of(rows: list[dict[str, Any]]) -> str:
     return '\n'.join([
         '# Faults of a robot on wires', '',
         f'Command: `./cg exec python bench/wires_faults.py --times {times}'
-        f' --seed {seed} --rate {rate:g}{" --first" * first}`; this page: the same with `--table-only --write`. '
-        f'Sources {version}. The loop of the robot runs at {rate:g} Hz. Drive, IMU and body are '
-        f'emulated in another process.{priority}', '',
+        f' --seed {seed} --rate {rate:g}{" --first" * first}`; this page: the same with '
+        f'`--table-only --write`. Sources {version}. The loop of the robot runs at {rate:g} Hz. '
+        f'Drive, IMU and body are emulated in another process.{priority}', '',
         f'{len(rows) - len(thrown)} trials in {hours:.1f} h. Thrown away: {reasons["held up"]} in '
         f'which the host held the emulation up by more than {1e3 * HELD_UP:.0f} ms, '
         f'{reasons["no torque"]} without torque at the instant of the fault, {reasons["lost"]} in '

@@ -35,7 +35,7 @@ setup(
         'Topic :: Scientific/Engineering',
     ],
     packages=find_packages(exclude=['test', 'test.*']),
-    package_data={'': ['*.c', '*.css', '*.html', '*.js', '*.yaml']},
+    package_data={'': ['*.c', '*.h', '*.css', '*.html', '*.js', '*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

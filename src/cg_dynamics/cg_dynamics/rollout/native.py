@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations
-from cg_dynamics.rollout.compiler import shared_library
+from cg_dynamics.rollout.compiler import object_file, shared_library
 from cg_dynamics.rollout.fallback import (
     EASY,
     HALVINGS,
@@ -34,8 +34,6 @@ from cg_dynamics.rollout.vector_code import (
     vector_code,
     vector_math,
 )
-
-HERE = Path(__file__).parent
 
 
 class NativeRollout:
@@ -228,12 +226,10 @@ def states_source(e: Equations) -> str:
         'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
         'STATE_LIMIT': STATE_LIMIT, 'HALVINGS': HALVINGS, 'EASY': EASY,
     }  # fmt: skip
-    # Inlined at each stage of a step the rates compile twice as long and run no faster.
-    rates = rates.replace('static inline __attribute__((always_inline))', 'static')
     return _with_sizes(given, '\n'.join([
         vector_math(), rates, outputs, _prepare(shared_f),
         f'#define outputs(x, u, s, y) seen(x, u, s + {shared_f}, y)',
-        (HERE / 'rollout.c').read_text(),
+        _file('rollout.c'),
     ]))  # fmt: skip
 
 
@@ -246,7 +242,7 @@ def _prepare(shared: int) -> str:
 
 
 def windows_source(e: Equations, free: tuple[str, ...]) -> str:
-    """C of the sensitivities along a rollout.
+    """C of what windows.c asks of a model.
 
     Raises:
         UnsupportedError: for an operation that has no vector form.
@@ -260,42 +256,39 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
     given = {
         'WIDTH': WIDTH, 'NX': nx, 'NU': e.u.shape[0], 'NP': max(e.p.shape[0], 1),
         'NF': len(free), 'NY': e.outputs.shape[0], 'SHARED': shared_f + shared_h,
-        'HALVINGS': HALVINGS, 'STABLE': STABLE,
+        'LOCAL': nx + A.nnz() + B.nnz() + P.nnz(),
     }  # fmt: skip
     in_a, in_b = _places(A, nx), _places(B, nx + A.nnz())
     in_p = _places(P, nx + A.nnz() + B.nnz())
     in_c, in_d = _places(C, 0), _places(D, C.nnz())
     decay = [f'o[{k}]' for i, j, k in in_a if i == j]
     lines = [
-        vector_math(), rates, outputs,
+        vector_math(), _file('windows.h'), rates, outputs,
         '#define COLUMNS (NX + NF + 1)',
         _prepare(shared_f),
-        'static vd variational(const vd *x, vd (*S)[COLUMNS], const vd *u, const vd *du,'
-        ' const vd *s, int nc, const int *place, int late, vd *dx, vd (*dS)[COLUMNS])',
+        _entries('BY_INPUT', in_b), _entries('BY_FREE', in_p),
+        'static inline void times(const vd *o, const vd *a, vd *b)',
         '{',
-        f'    vd o[{nx + A.nnz() + B.nnz() + P.nnz() + 1}];',
-        '    rates_by(x, u, s, o);',
-        '    for (int i = 0; i < NX; i++) dx[i] = o[i];',
-        '    for (int c = 0; c < nc; c++) {',
-        *_product('dS', nx, in_a, 'o[{}] * S[{}][c]'),
-        '    }',
-        *(f'    if (place[{f}] >= 0) dS[{i}][place[{f}]] += o[{k}];' for i, f, k in in_p),
-        *(f'    if (late >= 0) dS[{i}][late] += o[{k}] * du[{v}];' for i, v, k in in_b),
-        f'    return -({" + ".join(decay) or "SPLAT(0.0)"});',
+        *_product('b[{}]', nx, in_a, 'o[{}] * a[{}]'),
         '}',
-        'static void output_sensitive(const vd *x, vd (*S)[COLUMNS], const vd *u, const vd *s,'
-        ' int nc, const int *place, vd (*C)[NX], vd (*J)[COLUMNS])',
+        'static vd decay(const vd *o)',
+        f'{{ return -({" + ".join(decay) or "SPLAT(0.0)"}); }}',
+        'static void output_sensitive(const vd *x, const vd *S, const vd *u, const vd *s, int nc,'
+        ' const int *place, vd *C, vd *J)',
         '{',
         f'    vd o[{C.nnz() + D.nnz() + 1}];',
         f'    outputs_by(x, u, s + {shared_f}, o);',
-        '    for (int j = 0; j < NY; j++) for (int i = 0; i < NX; i++) C[j][i] = SPLAT(0.0);',
-        *(f'    C[{j}][{i}] = o[{k}];' for j, i, k in in_c),
+        '    for (int i = 0; i < NY * NX; i++) C[i] = SPLAT(0.0);',
+        *(f'    C[{j} * NX + {i}] = o[{k}];' for j, i, k in in_c),
         '    for (int c = 0; c < nc; c++) {',
-        *_product('J', e.outputs.shape[0], in_c, 'o[{}] * S[{}][c]'),
+        *_product('J[{} * COLUMNS + c]', e.outputs.shape[0], in_c, 'o[{}] * S[{} * COLUMNS + c]'),
         '    }',
-        *(f'    if (place[{f}] >= 0) J[{j}][place[{f}]] += o[{k}];' for j, f, k in in_d),
+        *(f'    if (place[{f}] >= 0) J[{j} * COLUMNS + place[{f}]] += o[{k}];'
+          for j, f, k in in_d),
         '}',
-        (HERE / 'windows.c').read_text(),
+        _file('columns.c'),
+        'const WindowModel window_model = {NX, NU, NP, NF, NY, SHARED, LOCAL, BY_INPUT, BY_FREE,'
+        ' prepare, rates_by, decay, slopes, step, output_sensitive};',
     ]  # fmt: skip
     return _with_sizes(given, '\n'.join(lines))
 
@@ -303,9 +296,10 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
 def _vectorised(e: Equations, name: str, prepare: str, *results: ca.SX) -> tuple[str, int]:
     """C of what is not zero of some results, one after the other; and the size of `prepare`'s."""
     stacked = ca.vertcat(*(ca.vec(r.nz[:]) for r in results if r.nnz()))
-    return vector_code(
-        ca.Function(name, [e.x, e.u, e.p], [ca.densify(ca.cse(stacked))]), name, prepare
-    )
+    f = ca.Function(name, [e.x, e.u, e.p], [ca.densify(ca.cse(stacked))])
+    source, shared = vector_code(f, name, prepare)
+    # Inlined wherever they are called, these compile several times as long and run no faster.
+    return source.replace('static inline __attribute__((always_inline))', 'static'), shared
 
 
 def _places(matrix: ca.SX, first: int) -> list[tuple[int, int, int]]:
@@ -314,13 +308,23 @@ def _places(matrix: ca.SX, first: int) -> list[tuple[int, int, int]]:
     return [(i, j, first + k) for k, (i, j) in enumerate(zip(rows, columns, strict=True))]
 
 
+def _entries(name: str, places: list[tuple[int, int, int]]) -> str:
+    """C table of {row, column, place}, the columns in order, and an end beyond all columns."""
+    rows = ', '.join(f'{{{i}, {j}, {k}}}' for i, j, k in [*places, (0, 1 << 30, 0)])
+    return f'static const int {name}[][3] = {{{rows}}};'
+
+
 def _product(target: str, rows: int, places: list[tuple[int, int, int]], term: str) -> list[str]:
     """C lines of a sparse matrix times S."""
     return [
-        f'        {target}[{i}][c] = '
+        f'        {target.format(i)} = '
         f'{" + ".join(term.format(k, j) for a, j, k in places if a == i) or "SPLAT(0.0)"};'
         for i in range(rows)
     ]
+
+
+def _file(name: str) -> str:
+    return (Path(__file__).parent / name).read_text()
 
 
 def _with_sizes(given: dict, source: str) -> str:
@@ -333,7 +337,10 @@ def _states_library(e: Equations) -> Path:
 
 
 def _windows_library(e: Equations, free: tuple[str, ...]) -> Path:
-    return shared_library(windows_source(e, free), FLAGS)
+    given = {'WIDTH': WIDTH, 'HALVINGS': HALVINGS, 'STABLE': STABLE}
+    common = '\n'.join([vector_math(), _file('windows.h'), _file('windows.c')])
+    windows = object_file(_with_sizes(given, common), FLAGS)
+    return shared_library(windows_source(e, free), FLAGS, [windows])
 
 
 _NUMBER, _COUNT = ctypes.c_double, ctypes.c_int

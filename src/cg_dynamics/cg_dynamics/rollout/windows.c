@@ -3,22 +3,26 @@
 
    The variational equations are linear, so a window can set out before the ones before it are
    done: its sensitivities are those by its own first state, by the parameters and by the delay of
-   the inputs, and the caller chains the windows. Included below vector_math.c and the code that
-   rollout.py writes for the model, on which it depends for
-     prepare(p, s)                                    expressions of the parameters alone
-     variational(x, S, u, du, s, nc, place, late, dx, dS)   dx = f, dS = A S + P; returns -trace A
-     output_sensitive(x, S, u, s, nc, place, C, J)    J = C S + D, and C
-   and the sizes NX, NU, NP, NF, NY, SHARED, HALVINGS and STABLE. Columns of a window: its first
-   state, the free parameters by place[NF] (-1: held constant), and the delay by late (or -1). */
+   the inputs, and the caller chains the windows. Compiled once, below vector_math.c, windows.h and
+   the sizes HALVINGS and STABLE, and linked to each model's own code. Columns of a window: its first
+   state, the free parameters by place[nf] (-1: held constant), and the delay by late (or -1). */
 
 #include <stdlib.h>
 #include <string.h>
 
+#define NX window_model.nx
+#define NU window_model.nu
+#define NY window_model.ny
+#define COLUMNS (NX + window_model.nf + 1)
+#define LOCAL window_model.local
+
 static const int WHOLE = 1 << HALVINGS;
 
+/* Rows 0 .. k of the windows: states (nx each) and sensitivities (nx COLUMNS each), and their
+   slopes. */
 typedef struct {
-    vd x[NX], dx[NX], S[NX][COLUMNS], dS[NX][COLUMNS];
-} Row;
+    vd *x, *dx, *S, *dS;
+} History;
 
 static int steps_of(double dt, double largest)
 {
@@ -35,53 +39,67 @@ static int length_of(unsigned steps, int done)
     return length;
 }
 
+static int columns_of(const int *place, int late, Column *all)
+{
+    const int (*by)[3] = window_model.by_free;
+    int n = 0;
+    for (; n < NX; n++) all[n] = (Column){n, 0, 0, by};
+    for (int f = 0; f < window_model.nf; f++) {
+        int entries = 0;
+        while (by[entries][1] == f) entries++;
+        if (place[f] >= 0) all[n++] = (Column){place[f], entries, 0, by};
+        by += entries;
+    }
+    if (late < 0) return n;
+    int entries = 0;
+    while (window_model.by_input[entries][1] < NU) entries++;
+    all[n++] = (Column){late, entries, 1, window_model.by_input};
+    return n;
+}
+
 /* h seconds of the state and its sensitivities in place, each window by the steps that its rollout
    took: so these are the derivatives of what was simulated. Where a sensitivity would be unstable
    at a state that rests, steps are halved. */
-static void follow(vd *x, vd (*S)[COLUMNS], const vd *u, const vd *du, const vd *s, int nc,
-                   const int *place, int late, vd h, const unsigned *steps)
+static void follow(vd *x, vd *S, const vd *u, const vd *du, const vd *s, int nc,
+                   const Column *columns, vd h, const unsigned *steps)
 {
-    vd k1[NX], k2[NX], k3[NX], k4[NX], y[NX];
-    vd s1[NX][COLUMNS], s2[NX][COLUMNS], s3[NX][COLUMNS], s4[NX][COLUMNS], T[NX][COLUMNS];
+    const int nx = NX, local = LOCAL;
+    vd o[4 * local], y[nx];
     int done[WIDTH] = {0};
-#define STAGE(K, SK, FACTOR, KN, SN)                                                              \
-    for (int i = 0; i < NX; i++) {                                                                \
-        y[i] = x[i] + (FACTOR) * K[i];                                                            \
-        for (int c = 0; c < nc; c++) T[i][c] = S[i][c] + (FACTOR) * SK[i][c];                     \
-    }                                                                                             \
-    variational(y, T, u, du, s, nc, place, late, KN, SN);
     for (int going = 1; going;) {
         vd part;
-        const vd decay = variational(x, S, u, du, s, nc, place, late, k1, s1);
+        window_model.rates_by(x, u, s, o);
+        const vd rate = window_model.decay(o);
         going = 0;
         for (int l = 0; l < WIDTH; l++) {
             /* Windows that have arrived wait with steps of no length. */
             int length = done[l] < WHOLE ? length_of(steps[l], done[l]) : 0;
-            while (length > 1 && h[l] * length / WHOLE * decay[l] > STABLE) length /= 2;
+            while (length > 1 && h[l] * length / WHOLE * rate[l] > STABLE) length /= 2;
             part[l] = h[l] * length / WHOLE;
             done[l] += length;
             going |= done[l] < WHOLE;
         }
-        STAGE(k1, s1, part / 2.0, k2, s2)
-        STAGE(k2, s2, part / 2.0, k3, s3)
-        STAGE(k3, s3, part, k4, s4)
-        for (int i = 0; i < NX; i++) {
-            x[i] += part / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
-            for (int c = 0; c < nc; c++)
-                S[i][c] += part / 6.0 * (s1[i][c] + 2.0 * s2[i][c] + 2.0 * s3[i][c] + s4[i][c]);
+        for (int stage = 1; stage < 4; stage++) {
+            const vd ahead = stage < 3 ? 0.5 * part : part, *k = o + (stage - 1) * local;
+            for (int i = 0; i < nx; i++) y[i] = x[i] + ahead * k[i];
+            window_model.rates_by(y, u, s, o + stage * local);
         }
+        for (int i = 0; i < nx; i++)
+            x[i] += part / 6.0
+                    * (o[i] + 2.0 * o[local + i] + 2.0 * o[2 * local + i] + o[3 * local + i]);
+        window_model.step(o, part, S, du, nc, columns);
     }
 }
 
-/* The output j of a late sensor: its row J of the Jacobian at what it saw `delay` seconds ago.
-   history holds the rows 0 .. k of the windows, which begin early enough. */
-static void late_output(int j, int k, double delay, int delay_to, const Row *history,
-                        const int *first, const int *length, const double *time, const double *u,
-                        const double *du, const vd *s, int nc, const int *place, int late, vd *J)
+/* What late sensors saw `delay` seconds ago: the Jacobian J of all outputs then, C, and the rates. */
+static void look_back(int k, double delay, const History *history, const int *first,
+                      const int *length, const double *time, const double *u, const double *du,
+                      const vd *s, int nc, const Column *columns, const int *place, vd *C, vd *J,
+                      vd *dx)
 {
-    Row a, b;
-    vd past, h, held[NU], slope_held[NU], x[NX], S[NX][COLUMNS], dx[NX], dS[NX][COLUMNS];
-    vd C[NY][NX], all[NY][COLUMNS];
+    const int nx = NX, nu = NU, all = nx * COLUMNS;
+    int at[WIDTH], next[WIDTH], alike = 1;
+    vd past, h, held[nu + 1], slope_held[nu + 1], x[nx], S[all], end[all], o[LOCAL];
     vi before = {0};
     for (int l = 0; l < WIDTH; l++) {
         const int now = k < length[l] ? k : length[l] - 1;
@@ -90,50 +108,66 @@ static void late_output(int j, int k, double delay, int delay_to, const Row *his
         while (i > 0 && t[i] > seen) i--;
         /* Before the first row nobody simulated: straight on from there. */
         const int straight = i == now || seen <= t[0];
-        const int next = straight ? i : i + 1;
+        at[l] = i, next[l] = straight ? i : i + 1;
         before[l] = straight ? -1 : 0;
         past[l] = seen - t[i];
-        h[l] = straight ? 1 : t[next] - t[i];
-        for (int v = 0; v < NX; v++) {
-            a.x[v][l] = history[i].x[v][l], a.dx[v][l] = history[i].dx[v][l];
-            b.x[v][l] = history[next].x[v][l];
-            for (int c = 0; c < nc; c++) {
-                a.S[v][c][l] = history[i].S[v][c][l], a.dS[v][c][l] = history[i].dS[v][c][l];
-                b.S[v][c][l] = history[next].S[v][c][l];
-            }
-        }
-        for (int v = 0; v < NU; v++) {
-            held[v][l] = u[(first[l] + i) * NU + v];
-            slope_held[v][l] = du[(first[l] + i) * NU + v];
+        h[l] = straight ? 1 : t[next[l]] - t[i];
+        alike &= at[l] == at[0] && next[l] == next[0];
+        for (int v = 0; v < nu; v++) {
+            held[v][l] = u[(first[l] + i) * nu + v];
+            slope_held[v][l] = du[(first[l] + i) * nu + v];
         }
     }
+    History a = {history->x + at[0] * nx, history->dx + at[0] * nx,
+                 history->S + (size_t)at[0] * all, history->dS + (size_t)at[0] * all};
+    History b = {history->x + next[0] * nx, 0, history->S + (size_t)next[0] * all, 0};
+    /* Windows that look at different rows: these lane by lane. */
+    vd apart[alike ? 1 : 3 * (nx + all)];
+    if (!alike) {
+        vd *place_of[] = {apart, apart + nx, apart + 2 * nx, apart + 3 * nx,
+                          apart + 3 * nx + all, apart + 3 * nx + 2 * all};
+        for (int l = 0; l < WIDTH; l++) {
+            const size_t from = at[l], to = next[l];
+            for (int v = 0; v < nx; v++) {
+                place_of[0][v][l] = history->x[from * nx + v][l];
+                place_of[1][v][l] = history->dx[from * nx + v][l];
+                place_of[2][v][l] = history->x[to * nx + v][l];
+            }
+            for (int v = 0; v < all; v++) {
+                place_of[3][v][l] = history->S[from * all + v][l];
+                place_of[4][v][l] = history->dS[from * all + v][l];
+                place_of[5][v][l] = history->S[to * all + v][l];
+            }
+        }
+        a = (History){place_of[0], place_of[1], place_of[3], place_of[4]};
+        b = (History){place_of[2], 0, place_of[5], 0};
+    }
     /* The input of a row is held up to the next, so it gives the slope there too. */
-    variational(b.x, b.S, held, slope_held, s, nc, place, late, b.dx, b.dS);
+    window_model.rates_by(b.x, held, s, o);
+    window_model.slopes(o, b.S, slope_held, nc, columns, end);
     const vd q = past / h, r = 1.0 - q, zero = SPLAT(0.0);
     const vd a0 = v_select(before, SPLAT(1.0), (1.0 + 2.0 * q) * r * r);
     const vd a1 = v_select(before, zero, (1.0 + 2.0 * r) * q * q);
     const vd b0 = v_select(before, past, h * q * r * r), b1 = v_select(before, zero, -h * r * q * q);
-    for (int v = 0; v < NX; v++) {
-        x[v] = a0 * a.x[v] + a1 * b.x[v] + b0 * a.dx[v] + b1 * b.dx[v];
-        for (int c = 0; c < nc; c++)
-            S[v][c] = a0 * a.S[v][c] + a1 * b.S[v][c] + b0 * a.dS[v][c] + b1 * b.dS[v][c];
+    for (int v = 0; v < nx; v++) {
+        x[v] = a0 * a.x[v] + a1 * b.x[v] + b0 * a.dx[v] + b1 * o[v];
+        for (int c = v * COLUMNS; c < v * COLUMNS + nc; c++)
+            S[c] = a0 * a.S[c] + a1 * b.S[c] + b0 * a.dS[c] + b1 * end[c];
     }
-    output_sensitive(x, S, held, s, nc, place, C, all);
-    for (int c = 0; c < nc; c++) J[c] = all[j][c];
-    if (delay_to < 0) return;
-    variational(x, S, held, slope_held, s, nc, place, late, dx, dS);
-    for (int v = 0; v < NX; v++) J[delay_to] -= C[j][v] * v_select(before, a.dx[v], dx[v]);
+    window_model.output_sensitive(x, S, held, s, nc, place, C, J);
+    window_model.rates_by(x, held, s, o);
+    for (int v = 0; v < nx; v++) dx[v] = v_select(before, a.dx[v], o[v]);
 }
 
 /* Normal equations of windows of one record, each by its own columns.
 
-   Window l has the rows first[l] .. first[l] + length[l] of time (n), u and du (n, NU), the states
-   X (n, NX), their steps (n, most; rollout.c), the residuals R and the weights W (n, NY; 0 where no
+   Window l has the rows first[l] .. first[l] + length[l] of time (n), u and du (n, nu), the states
+   X (n, nx), their steps (n, most; rollout.c), the residuals R and the weights W (n, ny; 0 where no
    sample is). Its rows from[l] .. until[l]-1 count, and it reports its sensitivities at
    its row handed[l].
 
-   H (WIDTH, nc, nc) and g (WIDTH, nc) are sums of J'WWJ and J'WWR, S (WIDTH, NX, nc) what is
-   handed over, Jacobian (n, NY, nc) is filled if not null. delay (NY) in s and delay_to (NY), the
+   H (WIDTH, nc, nc) and g (WIDTH, nc) are sums of J'WWJ and J'WWR, S (WIDTH, nx, nc) what is
+   handed over, Jacobian (n, ny, nc) is filled if not null. delay (ny) in s and delay_to (ny), the
    column of each output's delay or -1, are those of late sensors. Returns 0 if memory is short. */
 int cgw_normal(const int *first, const int *length, const int *from, const int *until,
                const int *handed, const double *time, double largest, const double *u, const double *du,
@@ -141,19 +175,28 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                int most, const int *steps, const double *R, const double *W, const double *delay,
                const int *delay_to, double *H, double *g, double *S_handed, double *Jacobian)
 {
-    vd x[NX], S[NX][COLUMNS], J[NY][COLUMNS], C[NY][NX], parameters[NP], s[SHARED + 1], held[NU],
-        slope[NU], HH[COLUMNS][COLUMNS], gg[COLUMNS];
+    const int nx = NX, nu = NU, ny = NY, stride = COLUMNS, all = nx * stride;
+    vd x[nx], S[all], J[ny * stride], C[ny * nx], s[window_model.shared + 1], held[nu + 1],
+        slope[nu + 1], o[LOCAL], H_of[stride * stride], g_of[stride], parameters[window_model.np];
+    vd then[ny * stride], C_then[ny * nx], dx_then[nx], weight[ny], residual[ny], by[ny];
+    Column columns[stride];
     int rows = 0, any_late = 0;
     for (int l = 0; l < WIDTH; l++) rows = length[l] > rows ? length[l] : rows;
-    for (int j = 0; j < NY; j++) any_late |= delay[j] > 0 || delay_to[j] >= 0;
-    Row *history = any_late ? aligned_alloc(sizeof(vd), rows * sizeof(Row)) : 0;
-    if (any_late && !history) return 0;
-    for (int i = 0; i < NP; i++) parameters[i] = SPLAT(p[i]);
-    prepare(parameters, s);
-    memset(HH, 0, sizeof HH), memset(gg, 0, sizeof gg), memset(S, 0, sizeof S);
-    for (int i = 0; i < NX; i++) {
-        S[i][i] = SPLAT(1.0);
-        for (int l = 0; l < WIDTH; l++) x[i][l] = X[first[l] * NX + i];
+    for (int j = 0; j < ny; j++) any_late |= delay[j] > 0 || delay_to[j] >= 0;
+    History history = {0};
+    if (any_late) {
+        history.x = aligned_alloc(sizeof(vd), sizeof(vd) * rows * 2 * (nx + all));
+        if (!history.x) return 0;
+        history.dx = history.x + (size_t)rows * nx, history.S = history.dx + (size_t)rows * nx;
+        history.dS = history.S + (size_t)rows * all;
+    }
+    columns_of(place, late, columns);
+    for (int i = 0; i < window_model.np; i++) parameters[i] = SPLAT(p[i]);
+    window_model.prepare(parameters, s);
+    memset(H_of, 0, sizeof H_of), memset(g_of, 0, sizeof g_of), memset(S, 0, sizeof S);
+    for (int i = 0; i < nx; i++) {
+        S[i * stride + i] = SPLAT(1.0);
+        for (int l = 0; l < WIDTH; l++) x[i][l] = X[first[l] * nx + i];
     }
     for (int k = 0; k < rows; k++) {
         vd dt = {0};
@@ -164,35 +207,49 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                 dt[l] = time[row + 1] - time[row];
                 longest = dt[l] > longest ? dt[l] : longest;
             }
-            for (int v = 0; v < NU; v++) held[v][l] = u[row * NU + v], slope[v][l] = du[row * NU + v];
+            for (int v = 0; v < nu; v++) held[v][l] = u[row * nu + v], slope[v][l] = du[row * nu + v];
             if (k == handed[l])
-                for (int i = 0; i < NX; i++)
-                    for (int c = 0; c < nc; c++) S_handed[(l * NX + i) * nc + c] = S[i][c][l];
+                for (int i = 0; i < nx; i++)
+                    for (int c = 0; c < nc; c++)
+                        S_handed[(l * nx + i) * nc + c] = S[i * stride + c][l];
         }
         if (any_late) {
-            Row *now = history + k;
-            memcpy(now->x, x, sizeof x), memcpy(now->S, S, sizeof S);
-            variational(x, S, held, slope, s, nc, place, late, now->dx, now->dS);
+            window_model.rates_by(x, held, s, o);
+            memcpy(history.x + k * nx, x, sizeof x), memcpy(history.dx + k * nx, o, sizeof x);
+            memcpy(history.S + (size_t)k * all, S, sizeof S);
+            window_model.slopes(o, S, slope, nc, columns, history.dS + (size_t)k * all);
         }
-        output_sensitive(x, S, held, s, nc, place, C, J);
-        for (int j = 0; j < NY; j++) {
-            if (delay[j] > 0 || delay_to[j] >= 0)
-                late_output(j, k, delay[j], delay_to[j], history, first, length, time, u, du, s,
-                            nc, place, late, J[j]);
-            vd weight = {0}, residual = {0};
-            int any = 0;
+        window_model.output_sensitive(x, S, held, s, nc, place, C, J);
+        double looked = NAN; /* sensors that are equally late share a look */
+        int any = 0;
+        for (int j = 0; j < ny; j++) {
+            vd *own = J + j * stride;
+            if (delay[j] > 0 || delay_to[j] >= 0) {
+                if (delay[j] != looked)
+                    look_back(k, looked = delay[j], &history, first, length, time, u, du, s, nc,
+                              columns, place, C_then, then, dx_then);
+                memcpy(own, then + j * stride, sizeof(vd) * nc);
+                for (int v = 0; v < nx && delay_to[j] >= 0; v++)
+                    own[delay_to[j]] -= C_then[j * nx + v] * dx_then[v];
+            }
+            weight[j] = residual[j] = SPLAT(0.0);
             for (int l = 0; l < WIDTH; l++) {
                 if (k < from[l] || k >= until[l]) continue;
-                const int at = (first[l] + k) * NY + j;
-                weight[l] = W[at] * W[at], residual[l] = R[at];
+                const int at = (first[l] + k) * ny + j;
+                weight[j][l] = W[at] * W[at], residual[j][l] = R[at];
                 any |= W[at] != 0;
-                for (int c = 0; Jacobian && c < nc; c++) Jacobian[(size_t)at * nc + c] = J[j][c][l];
+                for (int c = 0; Jacobian && c < nc; c++) Jacobian[(size_t)at * nc + c] = own[c][l];
             }
-            if (!any) continue;
-            for (int a = 0; a < nc; a++) {
-                const vd wa = weight * J[j][a];
-                gg[a] += wa * residual;
-                for (int c = a; c < nc; c++) HH[a][c] += wa * J[j][c];
+        }
+        for (int a = 0; a < nc && any; a++) {
+            for (int j = 0; j < ny; j++) {
+                by[j] = weight[j] * J[j * stride + a];
+                g_of[a] += by[j] * residual[j];
+            }
+            for (int c = a; c < nc; c++) {
+                vd sum = H_of[a * stride + c];
+                for (int j = 0; j < ny; j++) sum += by[j] * J[j * stride + c];
+                H_of[a * stride + c] = sum;
             }
         }
         /* Rows of windows whose stamps are not regular may be cut into different intervals. */
@@ -205,14 +262,15 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                 part[l] = i < own ? dt[l] / own : 0;
                 taken[l] = k + 1 < length[l] && i < own ? steps[(first[l] + k) * most + i] : 1;
             }
-            follow(x, S, held, slope, s, nc, place, late, part, taken);
+            follow(x, S, held, slope, s, nc, columns, part, taken);
         }
     }
     for (int l = 0; l < WIDTH; l++)
         for (int a = 0; a < nc; a++) {
-            g[l * nc + a] = gg[a][l];
-            for (int c = 0; c < nc; c++) H[(l * nc + a) * nc + c] = HH[a < c ? a : c][a < c ? c : a][l];
+            g[l * nc + a] = g_of[a][l];
+            for (int c = 0; c < nc; c++)
+                H[(l * nc + a) * nc + c] = H_of[a < c ? a * stride + c : c * stride + a][l];
         }
-    free(history);
+    free(history.x);
     return 1;
 }
