@@ -431,7 +431,7 @@ def version_of_sources() -> str:
         *(
             f
             for p in packages
-            for kind in ('py', 'c')
+            for kind in ('py', 'c', 'h')
             for f in ROOT.glob(f'src/cg_{p}/cg_{p}/**/*.{kind}')
         ),
         ROOT / 'src/cg_bringup/cg_bringup/hidden.py',
