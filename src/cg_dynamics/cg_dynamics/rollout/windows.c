@@ -18,11 +18,19 @@
 
 static const int WHOLE = 1 << HALVINGS;
 
-/* Rows 0 .. k of the windows: states (nx each) and sensitivities (nx COLUMNS each), and their
-   slopes. */
+/* What is kept of a row of the windows for late sensors: state (nx) and sensitivities (nx COLUMNS),
+   and their slopes. Rows lie one behind the other, and the one `depth` later takes the place. */
 typedef struct {
     vd *x, *dx, *S, *dS;
-} History;
+} Row;
+
+static int size_of_row(void) { return 2 * NX * (1 + COLUMNS); }
+
+static Row row_of(vd *rows, size_t k)
+{
+    vd *x = rows + k * size_of_row(), *S = x + 2 * NX;
+    return (Row){x, x + NX, S, S + NX * COLUMNS};
+}
 
 static int steps_of(double dt, double largest)
 {
@@ -39,6 +47,7 @@ static int length_of(unsigned steps, int done)
     return length;
 }
 
+/* The columns, and how many there are. */
 static int columns_of(const int *place, int late, Column *all)
 {
     const int (*by)[3] = window_model.by_free;
@@ -91,8 +100,22 @@ static void follow(vd *x, vd *S, const vd *u, const vd *du, const vd *s, int nc,
     }
 }
 
+/* Rows of which a sensor that is late by `delay` needs two. */
+static int depth_of(double delay, const int *first, const int *length, const double *time)
+{
+    int depth = 2;
+    for (int l = 0; l < WIDTH; l++) {
+        const double *t = time + first[l];
+        for (int now = 0, i = 0; now < length[l]; now++) {
+            while (i < now && t[i + 1] <= t[now] - delay) i++;
+            if (now - i + 2 > depth) depth = now - i + 2;
+        }
+    }
+    return depth;
+}
+
 /* What late sensors saw `delay` seconds ago: the Jacobian J of all outputs then, C, and the rates. */
-static void look_back(int k, double delay, const History *history, const int *first,
+static void look_back(int k, double delay, vd *history, int depth, const int *first,
                       const int *length, const double *time, const double *u, const double *du,
                       const vd *s, int nc, const Column *columns, const int *place, vd *C, vd *J,
                       vd *dx)
@@ -108,39 +131,25 @@ static void look_back(int k, double delay, const History *history, const int *fi
         while (i > 0 && t[i] > seen) i--;
         /* Before the first row nobody simulated: straight on from there. */
         const int straight = i == now || seen <= t[0];
-        at[l] = i, next[l] = straight ? i : i + 1;
         before[l] = straight ? -1 : 0;
         past[l] = seen - t[i];
-        h[l] = straight ? 1 : t[next[l]] - t[i];
+        h[l] = straight ? 1 : t[i + 1] - t[i];
+        /* A window that has ended looks back from where the others are. */
+        at[l] = (k - now + i) % depth, next[l] = straight ? at[l] : (at[l] + 1) % depth;
         alike &= at[l] == at[0] && next[l] == next[0];
         for (int v = 0; v < nu; v++) {
             held[v][l] = u[(first[l] + i) * nu + v];
             slope_held[v][l] = du[(first[l] + i) * nu + v];
         }
     }
-    History a = {history->x + at[0] * nx, history->dx + at[0] * nx,
-                 history->S + (size_t)at[0] * all, history->dS + (size_t)at[0] * all};
-    History b = {history->x + next[0] * nx, 0, history->S + (size_t)next[0] * all, 0};
-    /* Windows that look at different rows: these lane by lane. */
-    vd apart[alike ? 1 : 3 * (nx + all)];
+    Row a = row_of(history, at[0]), b = row_of(history, next[0]);
+    vd apart[alike ? 1 : 2 * size_of_row()];
     if (!alike) {
-        vd *place_of[] = {apart, apart + nx, apart + 2 * nx, apart + 3 * nx,
-                          apart + 3 * nx + all, apart + 3 * nx + 2 * all};
+        a = row_of(apart, 0), b = row_of(apart, 1);
         for (int l = 0; l < WIDTH; l++) {
-            const size_t from = at[l], to = next[l];
-            for (int v = 0; v < nx; v++) {
-                place_of[0][v][l] = history->x[from * nx + v][l];
-                place_of[1][v][l] = history->dx[from * nx + v][l];
-                place_of[2][v][l] = history->x[to * nx + v][l];
-            }
-            for (int v = 0; v < all; v++) {
-                place_of[3][v][l] = history->S[from * all + v][l];
-                place_of[4][v][l] = history->dS[from * all + v][l];
-                place_of[5][v][l] = history->S[to * all + v][l];
-            }
+            const vd *from = row_of(history, at[l]).x, *to = row_of(history, next[l]).x;
+            for (int i = 0; i < size_of_row(); i++) a.x[i][l] = from[i][l], b.x[i][l] = to[i][l];
         }
-        a = (History){place_of[0], place_of[1], place_of[3], place_of[4]};
-        b = (History){place_of[2], 0, place_of[5], 0};
     }
     /* The input of a row is held up to the next, so it gives the slope there too. */
     window_model.rates_by(b.x, held, s, o);
@@ -183,12 +192,14 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
     int rows = 0, any_late = 0;
     for (int l = 0; l < WIDTH; l++) rows = length[l] > rows ? length[l] : rows;
     for (int j = 0; j < ny; j++) any_late |= delay[j] > 0 || delay_to[j] >= 0;
-    History history = {0};
+    vd *history = 0;
+    int depth = 0;
+    double longest_delay = 0;
     if (any_late) {
-        history.x = aligned_alloc(sizeof(vd), sizeof(vd) * rows * 2 * (nx + all));
-        if (!history.x) return 0;
-        history.dx = history.x + (size_t)rows * nx, history.S = history.dx + (size_t)rows * nx;
-        history.dS = history.S + (size_t)rows * all;
+        for (int j = 0; j < ny; j++) longest_delay = fmax(longest_delay, delay[j]);
+        depth = depth_of(longest_delay, first, length, time);
+        history = aligned_alloc(sizeof(vd), sizeof(vd) * depth * size_of_row());
+        if (!history) return 0;
     }
     columns_of(place, late, columns);
     for (int i = 0; i < window_model.np; i++) parameters[i] = SPLAT(p[i]);
@@ -207,17 +218,18 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                 dt[l] = time[row + 1] - time[row];
                 longest = dt[l] > longest ? dt[l] : longest;
             }
-            for (int v = 0; v < nu; v++) held[v][l] = u[row * nu + v], slope[v][l] = du[row * nu + v];
+            for (int v = 0; v < nu; v++)
+                held[v][l] = u[row * nu + v], slope[v][l] = du[row * nu + v];
             if (k == handed[l])
                 for (int i = 0; i < nx; i++)
                     for (int c = 0; c < nc; c++)
                         S_handed[(l * nx + i) * nc + c] = S[i * stride + c][l];
         }
         if (any_late) {
+            const Row now = row_of(history, k % depth);
             window_model.rates_by(x, held, s, o);
-            memcpy(history.x + k * nx, x, sizeof x), memcpy(history.dx + k * nx, o, sizeof x);
-            memcpy(history.S + (size_t)k * all, S, sizeof S);
-            window_model.slopes(o, S, slope, nc, columns, history.dS + (size_t)k * all);
+            memcpy(now.x, x, sizeof x), memcpy(now.dx, o, sizeof x), memcpy(now.S, S, sizeof S);
+            window_model.slopes(o, S, slope, nc, columns, now.dS);
         }
         window_model.output_sensitive(x, S, held, s, nc, place, C, J);
         double looked = NAN; /* sensors that are equally late share a look */
@@ -226,8 +238,8 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
             vd *own = J + j * stride;
             if (delay[j] > 0 || delay_to[j] >= 0) {
                 if (delay[j] != looked)
-                    look_back(k, looked = delay[j], &history, first, length, time, u, du, s, nc,
-                              columns, place, C_then, then, dx_then);
+                    look_back(k, looked = delay[j], history, depth, first, length, time, u, du,
+                              s, nc, columns, place, C_then, then, dx_then);
                 memcpy(own, then + j * stride, sizeof(vd) * nc);
                 for (int v = 0; v < nx && delay_to[j] >= 0; v++)
                     own[delay_to[j]] -= C_then[j * nx + v] * dx_then[v];
@@ -271,6 +283,6 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
             for (int c = 0; c < nc; c++)
                 H[(l * nc + a) * nc + c] = H_of[a < c ? a * stride + c : c * stride + a][l];
         }
-    free(history.x);
+    free(history);
     return 1;
 }
