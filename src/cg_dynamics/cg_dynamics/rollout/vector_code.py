@@ -4,7 +4,7 @@ What depends on parameters alone is computed once, ahead of all calls.
 """
 
 import re
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -95,7 +95,7 @@ def vector_code(f: ca.Function, name: str, prepare: str) -> tuple[str, int]:
     ]), shared  # fmt: skip
 
 
-def _in_pieces(name: str, statements: Sequence[str]) -> tuple[list[str], Sequence[str]]:
+def _in_pieces(name: str, statements: list[str]) -> tuple[list[str], list[str]]:
     """Functions of PIECE statements each, and the statements that call them."""
     if len(statements) <= PIECE:
         return [], statements
@@ -108,16 +108,16 @@ def _in_pieces(name: str, statements: Sequence[str]) -> tuple[list[str], Sequenc
             for found in value.findall(statement):
                 if home.setdefault(found, k) < k:
                     handed.setdefault(found, len(handed))
+
+    def placed(k: int, found: re.Match[str]) -> str:
+        name = found[0]
+        return f'w[{handed[name]}]' if home[name] < k else name
+
     arguments = 'const vd *x, const vd *u, const vd *s, vd *w, vd *dx'
     lines = []
     for k, piece in enumerate(pieces):
         lines.append(f'static __attribute__((noinline)) void {name}_{k}({arguments})\n{{')
-        lines += [
-            value.sub(
-                lambda m, k=k: f'w[{handed[m[0]]}]' if home[m[0]] < k else m[0], statement
-            )
-            for statement in piece
-        ]  # fmt: skip
+        lines += [value.sub(partial(placed, k), statement) for statement in piece]
         lines += [f'    w[{at}] = {found};' for found, at in handed.items() if home[found] == k]
         lines.append('}')
     calls = [f'    {name}_{k}(x, u, s, w, dx);' for k in range(len(pieces))]
