@@ -141,23 +141,31 @@ class NativeRollout:
             handed, by_lane,
         ):  # fmt: skip
             raise MemoryError(f'no memory for the sensitivities of {n} rows of late sensors')
-        chain = np.zeros((lanes.count, k, nc))  # d(a window's columns)/d(columns)
-        chain[:, self.nx + np.arange(len(active)), column[active]] = 1.0
+        # d(a window's columns)/d(columns): those of its first state, and the same for all windows.
+        start, shared = np.empty((lanes.count, self.nx, nc)), np.zeros((k - self.nx, nc))
+        shared[np.arange(len(active)), column[active]] = 1.0
         if lanes.late >= 0:
-            chain[:, lanes.late, delay_column] = 1.0
-        chain[0, : self.nx] = S0
-        used = slice(lanes.count)
+            shared[-1, delay_column] = 1.0
+        start[0] = S0
+        own, rest = slice(self.nx), slice(self.nx, None)
+        hessian, gradient = hessian[: lanes.count], gradient[: lanes.count]
         # Sensitivities of a motion that runs away do so too; whoever fits sees it by these sums.
         with np.errstate(over='ignore', invalid='ignore'):
             for w in range(1, lanes.count):
-                chain[w, : self.nx] = handed[w - 1] @ chain[w - 1]
-            H += (chain.transpose(0, 2, 1) @ hessian[used] @ chain).sum(axis=0)
-            g += np.einsum('wkc,wk->c', chain, gradient[used])
+                passed = handed[w - 1]
+                start[w] = passed[:, own] @ start[w - 1] + passed[:, rest] @ shared
+            by_start = hessian[:, own, own] @ start + hessian[:, own, rest] @ shared
+            by_shared = (hessian[:, rest, own] @ start).sum(axis=0)
+            by_shared += hessian[:, rest, rest].sum(axis=0) @ shared
+            H += (start.transpose(0, 2, 1) @ by_start).sum(axis=0) + shared.T @ by_shared
+            g += np.einsum('wsc,ws->c', start, gradient[:, own])
+            g += gradient[:, rest].sum(axis=0) @ shared
         if Jacobian is not None and by_lane is not None:
             for w in range(lanes.count):
                 first = lanes.first[w]
                 judged = slice(first + lanes.start[w], first + lanes.until[w])
-                Jacobian[judged] = by_lane[judged] @ chain[w]
+                Jacobian[judged] = by_lane[judged][:, :, own] @ start[w]
+                Jacobian[judged] += by_lane[judged][:, :, rest] @ shared
 
 
 @dataclass(frozen=True)
