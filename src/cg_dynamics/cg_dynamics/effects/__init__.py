@@ -38,5 +38,7 @@ def make_effect(name: str, mechanism: Mechanism, at: str | None = None) -> Effec
     """
     known = LIBRARY.get(name) or UNMODELLED.get(name)
     if known is None:
-        raise ModelError(f'unknown effect {name!r}; the library has: {", ".join(LIBRARY)}')
+        longest = max(map(len, LIBRARY))
+        named = name if len(name) <= longest else f'{name[:longest]}…'
+        raise ModelError(f'unknown effect {named!r}; the library has: {", ".join(LIBRARY)}')
     return known(mechanism, at)
