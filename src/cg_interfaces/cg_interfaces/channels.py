@@ -230,7 +230,9 @@ def mechanism(name: str) -> Mechanism:
     from cg_dynamics.mechanisms import MECHANISMS as BODIES  # symbols: nodes start without
 
     if name not in BODIES:
-        msg = f'unknown mechanism {name!r}; known are {", ".join({**MECHANISMS, **BODIES})}'
+        from cg_description.reading import shown
+
+        msg = f'unknown mechanism {shown(name)}; known are {", ".join({**MECHANISMS, **BODIES})}'
         raise ValueError(msg)
     return _of_joints(BODIES[name])
 

@@ -219,6 +219,8 @@ def test_a_record_can_be_cut_at_a_value(tmp_path):
         ({'format': 'other'}, "format: 'other' is not cg_import/1"),
         ({'files': None}, 'files: is missing'),
         ({'files': '*.bin'}, 'no file matches'),
+        ({'files': '*\n.csv'}, r"no file matches '\*\\n.csv'"),
+        ({'mechanism': 'x' * 2000}, "unknown mechanism 'x{40}…'; known are"),
         ({'colour': 'red'}, "unknown entry 'colour'"),
         (
             {'mechanism': 'cart_pole'},

@@ -7,6 +7,7 @@ Every module here that defines a subclass of `Effect` with a name is found by it
 import importlib
 import pkgutil
 
+from cg_description.reading import shown
 from cg_dynamics.effects.effect import Body, Effect
 from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.errors import ModelError
@@ -38,7 +39,5 @@ def make_effect(name: str, mechanism: Mechanism, at: str | None = None) -> Effec
     """
     known = LIBRARY.get(name) or UNMODELLED.get(name)
     if known is None:
-        longest = max(map(len, LIBRARY))
-        named = name if len(name) <= longest else f'{name[:longest]}…'
-        raise ModelError(f'unknown effect {named!r}; the library has: {", ".join(LIBRARY)}')
+        raise ModelError(f'unknown effect {shown(name)}; the library has: {", ".join(LIBRARY)}')
     return known(mechanism, at)

@@ -8,6 +8,7 @@ import pkgutil
 from collections.abc import Mapping
 from typing import Any
 
+from cg_description.reading import shown
 from cg_description.robot_description import RobotDescriptionError, parse
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms.mechanism import Mechanism
@@ -56,5 +57,5 @@ def mechanism(name: str, robot: Mapping[str, Any] | None = None) -> Mechanism:
         return MECHANISMS[name]
     except KeyError:
         raise ModelError(
-            f'unknown mechanism {name!r}; there are: {", ".join((*MECHANISMS, URDF))}'
+            f'unknown mechanism {shown(name)}; there are: {", ".join((*MECHANISMS, URDF))}'
         ) from None

@@ -245,7 +245,7 @@ def import_logs(
     patterns = mapping['files']
     found = sorted({path for pattern in patterns for path in data_dir.glob(pattern)})
     if not found:
-        raise RecordingError(f'{data_dir}: no file matches {", ".join(patterns)}')
+        raise RecordingError(f'{data_dir}: no file matches {", ".join(map(shown, patterns))}')
     for done, path in enumerate(found):
         progress('reading logs and writing recordings', done, len(found))
         table = read_table(path)
