@@ -341,8 +341,8 @@ def tables(run: Run) -> Iterator[str]:
     yield from ('', '| topic | in the bag | missing | out of order |', '|---|---:|---:|---:|')
     for topic, (count, missing, wrong) in run.samples.items():
         yield f'| {topic} | {count} | {missing} | {wrong} |'
-    yield from ('', 'The bag says of itself: ' + '; '.join(
-        f'{key} {value}' for key, value in sorted(run.remarks.items())) + '.')  # fmt: skip
+    remarks = '; '.join(f'{key} {value}' for key, value in sorted(run.remarks.items()))
+    yield from ('', f'The bag says of itself: {remarks or "nothing"}.')
 
 
 def states(rows: np.ndarray) -> Iterator[np.ndarray]:
