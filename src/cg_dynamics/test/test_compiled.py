@@ -16,7 +16,6 @@ from cg_dynamics.rig import Setup
 from cg_dynamics.rollout import compiled as module
 from cg_dynamics.rollout import compiler as c_compiler
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model, simulate
-from cg_dynamics.rollout.native import windows_source
 
 TIME = np.arange(0, 0.4, 0.002)
 TORQUE = (6 * np.sin(2 * np.pi * 3 * TIME) + 3 * np.cos(50 * TIME))[:, None]
@@ -127,25 +126,6 @@ def test_normal_equations_are_those_of_the_jacobian(robot, rng):
     np.testing.assert_allclose(normal.sse, (residual**2).sum(axis=0), rtol=1e-12)
     np.testing.assert_array_equal(normal.count, (~np.isnan(measured)).sum(axis=0))
     assert normal.rows == len(TIME)
-
-
-def test_long_functions_compute_in_pieces_what_they_do_in_one(bare, monkeypatch):
-    model = bare.with_effect('stribeck_friction').with_effect('sensor_delay', delay=0.0047)
-    setup = Setup()
-    known, p = compile_model(model, setup), parameter_vector(model, setup)
-    motion, nf = np.array([0.05, 0.12, 0.2, -0.3]), len(known.free)
-    x0, by_motion, by_free = known.initial_sensitivity(motion, TORQUE[0], p)
-    s0, column = np.hstack([by_motion, by_free]), np.arange(4, 4 + nf)
-    measured, weight = np.zeros((len(TIME), 3)), np.ones(3)
-    found = []
-    for most, pieces in ((10**6, False), (60, True)):
-        monkeypatch.setattr('cg_dynamics.rollout.vector_code.PIECE', most)
-        assert ('rates_by_1' in windows_source(known.equations, known.free)) == pieces
-        compiled = CompiledModel(known.equations, known.free)
-        found.append(compiled.normal(TIME, TORQUE, x0, s0, p, column, measured, weight, keep=True))
-    # Rounding: products and sums are contracted differently at the seams.
-    for a, b in zip(found[0][1:], found[1][1:], strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-12 * np.abs(a).max())
 
 
 def test_parameters_without_a_column_stay_constant(robot):

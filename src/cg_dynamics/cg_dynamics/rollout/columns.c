@@ -5,11 +5,12 @@
 /* The slope A a + P of a column whose values are a. */
 static inline void slope_of(const Column *c, const vd *o, const vd *du, const vd *a, vd *slope)
 {
+    const int (*by)[3] = c->by, (*end)[3] = by + c->entries;
     times(o, a, slope);
-    for (int e = 0; e < c->entries; e++) {
-        const int *by = c->by[e];
-        slope[by[0]] += c->is_delay ? o[by[2]] * du[by[1]] : o[by[2]];
-    }
+    if (c->is_delay)
+        for (; by < end; by++) slope[(*by)[0]] += o[(*by)[2]] * du[(*by)[1]];
+    else
+        for (; by < end; by++) slope[(*by)[0]] += o[(*by)[2]];
 }
 
 static void slopes(const vd *o, const vd *S, const vd *du, int nc, const Column *columns, vd *dS)

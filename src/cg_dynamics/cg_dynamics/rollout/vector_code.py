@@ -3,8 +3,6 @@
 What depends on parameters alone is computed once, ahead of all calls.
 """
 
-import re
-from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -17,9 +15,6 @@ FLAGS = (
     '-O2', '-march=native', '-fno-math-errno', '-fno-trapping-math', '-fno-signed-zeros',
     '-freciprocal-math', '-ffp-contract=fast',
 )  # fmt: skip
-
-# Compilers hand out registers in a time that grows faster than the length of a function.
-PIECE = 1000  # statements of one
 
 BINARY = {
     ca.OP_ADD: '{0} + {1}',
@@ -82,46 +77,14 @@ def vector_code(f: ca.Function, name: str, prepare: str) -> tuple[str, int]:
         UnsupportedError: for an operation that has no vector form.
     """
     before, statements, shared = _vector_form(f)
-    pieces, statements = _in_pieces(name, statements)
     return '\n'.join([
         f'static void {prepare}(const vd *p, vd *s)\n{{',
         *before,
-        '}',
-        *pieces,
-        f'static inline __attribute__((always_inline)) void {name}(const vd *x, const vd *u,'
+        f'}}\nstatic inline __attribute__((always_inline)) void {name}(const vd *x, const vd *u,'
         ' const vd *s, vd *dx)\n{',
         *statements,
         '}',
     ]), shared  # fmt: skip
-
-
-def _in_pieces(name: str, statements: list[str]) -> tuple[list[str], list[str]]:
-    """Functions of PIECE statements each, and the statements that call them."""
-    if len(statements) <= PIECE:
-        return [], statements
-    pieces = [statements[k : k + PIECE] for k in range(0, len(statements), PIECE)]
-    value = re.compile(r'\b[asc]\d+\b')  # names that _vector_form gives
-    home: dict[str, int] = {}  # name -> the piece that computes it
-    handed: dict[str, int] = {}  # name -> place in w, of what later pieces need
-    for k, piece in enumerate(pieces):
-        for statement in piece:
-            for found in value.findall(statement):
-                if home.setdefault(found, k) < k:
-                    handed.setdefault(found, len(handed))
-
-    def placed(k: int, found: re.Match[str]) -> str:
-        name = found[0]
-        return f'w[{handed[name]}]' if home[name] < k else name
-
-    arguments = 'const vd *x, const vd *u, const vd *s, vd *w, vd *dx'
-    lines = []
-    for k, piece in enumerate(pieces):
-        lines.append(f'static __attribute__((noinline)) void {name}_{k}({arguments})\n{{')
-        lines += [value.sub(partial(placed, k), statement) for statement in piece]
-        lines += [f'    w[{at}] = {found};' for found, at in handed.items() if home[found] == k]
-        lines.append('}')
-    calls = [f'    {name}_{k}(x, u, s, w, dx);' for k in range(len(pieces))]
-    return lines, [f'    vd w[{len(handed) + 1}];', *calls]
 
 
 def _vector_form(f: ca.Function) -> tuple[list[str], list[str], int]:

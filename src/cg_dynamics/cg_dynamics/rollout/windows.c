@@ -258,10 +258,13 @@ int cgw_normal(const int *first, const int *length, const int *from, const int *
                 by[j] = weight[j] * J[j * stride + a];
                 g_of[a] += by[j] * residual[j];
             }
-            for (int c = a; c < nc; c++) {
-                vd sum = H_of[a * stride + c];
-                for (int j = 0; j < ny; j++) sum += by[j] * J[j * stride + c];
-                H_of[a * stride + c] = sum;
+            /* Two outputs at a time: with many columns H is the most that is read and written. */
+            for (int j = 0; j < ny; j += 2) {
+                const int other = j + 1 < ny ? j + 1 : j;
+                const vd one = by[j], two = other > j ? by[other] : SPLAT(0.0);
+                const vd *J_one = J + j * stride, *J_two = J + other * stride;
+                vd *sum = H_of + a * stride;
+                for (int c = a; c < nc; c++) sum[c] += one * J_one[c] + two * J_two[c];
             }
         }
         /* Rows of windows whose stamps are not regular may be cut into different intervals. */
