@@ -236,7 +236,7 @@ def labels(case: Case) -> list[str]:
     return found
 
 
-def run(case: Case, version: str, limit: float, cores: int = 1) -> dict[str, Any]:
+def run(case: Case, version: str, limit: float, cores: int) -> dict[str, Any]:
     """One line of the raw results."""
     robot = ROBOTS[case.robot]
     about = {
@@ -384,7 +384,7 @@ def main() -> int:
     parser.add_argument('--robot', choices=list(ROBOTS), help='only this one')
     parser.add_argument('--sample', type=int, help='so many of all cases')
     parser.add_argument(
-        '--cores', type=int, default=os.cpu_count(),
+        '--cores', type=int, default=os.cpu_count() or 1,
         help='of a case, as many cases side by side as there are cores for [all]',
     )  # fmt: skip
     parser.add_argument(
@@ -429,7 +429,8 @@ def main() -> int:
         drawn = f', {len(shown)} of them run' if len(shown) < every else ''
         options.write.write_text('\n'.join([
             '# Robots of a URDF that share no code with the models', '',
-            'Command: `./cg exec python bench/robots.py`; this table of its rows: the same with '
+            'Command: `./cg exec python bench/robots.py --cores '
+            f'{shown[0].get("cores", 1)}`; this table of its rows: the same with '
             f'`--table-only --write FILE`. Sources {shown[0]["version"]}.',
             f'The programme: {every} cases{drawn}. What is right is written at the head of '
             'the bench, and was settled before any case was run.', '', *lines, '',

@@ -5,7 +5,8 @@
 Random trees of turning joints (random_trees.py of the tests), each joint with viscous and dry
 friction, swinging under gravity: 10 s at 500 Hz, Runge-Kutta of order 4 at steps of 2 ms in both
 engines, MuJoCo in its own loop in C. Sensitivities are those that a fit asks for: of all that is
-identified, and of the start. MuJoCo has none of a whole rollout; as many rollouts more as there
+identified, and of the start; and once more where all sensors are late by 4.7 ms, which is
+identified as well. MuJoCo has none of a whole rollout; as many rollouts more as there
 are columns is what central differences would take half of.
 
 CPU time of the calling thread, the median of the repetitions, which alternate between engines.
@@ -42,6 +43,7 @@ SEED = 11
 STEP, ROWS = 0.002, 5001
 TIMES = 21
 VISCOUS, DRY = 1.5, 0.3  # N m s/rad, N m
+LATE = 0.0047  # s, between two rows
 SETUP = Setup()
 RESULT = Path(__file__).parent / 'results/robots_rollout.md'
 
@@ -101,9 +103,13 @@ def row(joints: int) -> str:
     plain_compile = time.perf_counter() - began
     data_sets = prepare(model, [record_of(model, states, np.round(moment * 1e9).astype(np.int64))])
     unknowns = unknowns_of(model)
-    problem = Problem(model, data_sets, unknowns, [data_sets[0].motion], 1.0)
+    motion = data_sets[0].motion
+    problem = Problem(model, data_sets, unknowns, [motion], 1.0)
     values = np.array([unknown.prior for unknown in unknowns])
-    motion = problem.guesses[0]
+    late = model.with_effect('sensor_delay', delay=LATE)
+    late_unknowns = unknowns_of(late)
+    late_problem = Problem(late, data_sets, late_unknowns, [motion], 1.0)
+    late_values = np.array([unknown.prior for unknown in late_unknowns])
     began = time.perf_counter()
     follow(problem, 0, values, motion, np.inf).normal()
     compile_s = time.perf_counter() - began
@@ -113,17 +119,19 @@ def row(joints: int) -> str:
     calls = {
         'ours': lambda: compiled.simulate(moment, u, x0, p),
         'fit': lambda: follow(problem, 0, values, motion, np.inf).normal(),
+        'late': lambda: follow(late_problem, 0, late_values, motion, np.inf).normal(),
         'mujoco': lambda: rollout.rollout(theirs, data, start, nstep=ROWS - 1),
     }
     spent = {name: [] for name in calls}
     for _ in range(TIMES):
         for name, call in calls.items():
             spent[name].append(cpu(call))
-    ours, sensitive, mj = (1e3 * float(np.median(spent[name])) for name in calls)
+    ours, sensitive, sensitive_late, mj = (1e3 * float(np.median(spent[name])) for name in calls)
     columns = len(motion) + len(unknowns)
     return (
         f'| {joints} | {ours:.2f} | {mj:.1f} | {mj / ours:.0f} | {columns} | {sensitive:.1f} '
-        f'| {columns * mj / sensitive:.0f} | {plain_compile:.1f} | {compile_s:.1f} |'
+        f'| {sensitive_late:.1f} | {columns * mj / sensitive:.0f} '
+        f'| {plain_compile:.1f} | {compile_s:.1f} |'
     )
 
 
@@ -136,8 +144,9 @@ def main() -> None:
         'Command: `./cg exec python bench/robots_rollout.py --write`. 10 s at 500 Hz, CPU ms of '
         f'one core, median of {TIMES}; compile times are wall time, once for each structure.', '',
         '| joints | ours | MuJoCo | MuJoCo / ours | columns | ours with sensitivities '
-        '| MuJoCo, a rollout for each column / ours | compile, s | of sensitivities, s |',
-        '|---:|---:|---:|---:|---:|---:|---:|---:|---:|',
+        '| sensors late | MuJoCo, a rollout for each column / ours | compile, s '
+        '| of sensitivities, s |',
+        '|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|',
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as cache:
         os.environ['CG_CACHE'] = cache

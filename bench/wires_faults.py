@@ -18,8 +18,7 @@ than 10 ms says nothing: its line says so, and it is done again, with other draw
 
 `--first` gives robot and devices real-time priority, for a host that has other work. Where they
 need most of all processors it does harm: Linux lets real-time work have 95 % of a second, and then
-stops it. `--rate` is that of the robot's loop: a host whose processors cannot carry 500 Hz loses
-the robot with nothing done to it. What was run in another way is kept apart.
+stops it. `--rate` is that of the robot's loop. What was run in another way is kept apart.
 """
 
 import argparse

@@ -25,7 +25,7 @@ from cg_dynamics.stop_request import Stopped
 from cg_interfaces import topics
 from cg_sysid.experiments.catalogue import ExperimentError, experiment_names, load_experiment
 from cg_sysid.progress import Bars
-from cg_sysid.records.bags import read_bag
+from cg_sysid.records.bags import read_raw
 
 RATE_HZ = 500.0  # of a simulated robot
 ENOUGH = 0.95  # of the samples of a real robot, whose host misses some
@@ -144,7 +144,7 @@ def check_counts(run: Run) -> dict[str, int]:
     }
     expected = round(run.length * RATE_HZ)
     if run.mode == WIRED:
-        rate = read_bag(run.bag).note.get('nominal_rate_hz', RATE_HZ)
+        rate = read_raw(run.bag).note.get('nominal_rate_hz', RATE_HZ)
         expected = round(ENOUGH * run.length * rate)
     commands = expected if run.mode == 'lockstep' else 0
     sparing = {topics.TORQUE_COMMAND: commands, topics.EXPERIMENT: 1, topics.DRIVE_ENABLED: 0}

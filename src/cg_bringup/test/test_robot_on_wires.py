@@ -60,7 +60,7 @@ def standing():
 
 def believed(report):
     """A report of deadlines, from an emulation that kept its own."""
-    if report['late'] > HELD_UP:
+    if report['late'] > HELD_UP and 'CG_NO_EXCUSE' not in os.environ:
         pytest.skip(f'the host held the emulation up by {report["late"]:.3f} s')
     return report
 

@@ -142,29 +142,29 @@ class NativeRollout:
         ):  # fmt: skip
             raise MemoryError(f'no memory for the sensitivities of {n} rows of late sensors')
         # d(a window's columns)/d(columns): those of its first state, and the same for all windows.
-        start, shared = np.empty((lanes.count, self.nx, nc)), np.zeros((k - self.nx, nc))
+        S, shared = np.empty((lanes.count, self.nx, nc)), np.zeros((k - self.nx, nc))
         shared[np.arange(len(active)), column[active]] = 1.0
         if lanes.late >= 0:
             shared[-1, delay_column] = 1.0
-        start[0] = S0
+        S[0] = S0
         own, rest = slice(self.nx), slice(self.nx, None)
         hessian, gradient = hessian[: lanes.count], gradient[: lanes.count]
         # Sensitivities of a motion that runs away do so too; whoever fits sees it by these sums.
         with np.errstate(over='ignore', invalid='ignore'):
             for w in range(1, lanes.count):
                 passed = handed[w - 1]
-                start[w] = passed[:, own] @ start[w - 1] + passed[:, rest] @ shared
-            by_start = hessian[:, own, own] @ start + hessian[:, own, rest] @ shared
-            by_shared = (hessian[:, rest, own] @ start).sum(axis=0)
+                S[w] = passed[:, own] @ S[w - 1] + passed[:, rest] @ shared
+            by_state = hessian[:, own, own] @ S + hessian[:, own, rest] @ shared
+            by_shared = (hessian[:, rest, own] @ S).sum(axis=0)
             by_shared += hessian[:, rest, rest].sum(axis=0) @ shared
-            H += (start.transpose(0, 2, 1) @ by_start).sum(axis=0) + shared.T @ by_shared
-            g += np.einsum('wsc,ws->c', start, gradient[:, own])
+            H += (S.transpose(0, 2, 1) @ by_state).sum(axis=0) + shared.T @ by_shared
+            g += np.einsum('wsc,ws->c', S, gradient[:, own])
             g += gradient[:, rest].sum(axis=0) @ shared
         if Jacobian is not None and by_lane is not None:
             for w in range(lanes.count):
                 first = lanes.first[w]
                 judged = slice(first + lanes.start[w], first + lanes.until[w])
-                Jacobian[judged] = by_lane[judged][:, :, own] @ start[w]
+                Jacobian[judged] = by_lane[judged][:, :, own] @ S[w]
                 Jacobian[judged] += by_lane[judged][:, :, rest] @ shared
 
 
@@ -305,9 +305,8 @@ def _vectorised(e: Equations, name: str, prepare: str, *results: ca.SX) -> tuple
     """C of what is not zero of some results, one after the other; and the size of `prepare`'s."""
     stacked = ca.vertcat(*(ca.vec(r.nz[:]) for r in results if r.nnz()))
     f = ca.Function(name, [e.x, e.u, e.p], [ca.densify(ca.cse(stacked))])
-    source, shared = vector_code(f, name, prepare)
     # Inlined wherever they are called, these compile several times as long and run no faster.
-    return source.replace('static inline __attribute__((always_inline))', 'static'), shared
+    return vector_code(f, name, prepare, inline=False)
 
 
 def _places(matrix: ca.SX, first: int) -> list[tuple[int, int, int]]:

@@ -62,13 +62,14 @@ def vector_math() -> str:
     return (Path(__file__).parent / 'vector_math.c').read_text()
 
 
-def vector_code(f: ca.Function, name: str, prepare: str) -> tuple[str, int]:
+def vector_code(f: ca.Function, name: str, prepare: str, inline: bool = True) -> tuple[str, int]:
     """A function (x, u, p) -> y as two C functions on vectors.
 
     Args:
         f: The function; its result is dense.
         name: Of name(x, u, s, dx), which fills dx with y.
         prepare: Of prepare(p, s), which fills s with what depends on the parameters alone.
+        inline: Wherever it is called; else it is compiled once.
 
     Returns:
         The source, and how many values s holds.
@@ -77,10 +78,11 @@ def vector_code(f: ca.Function, name: str, prepare: str) -> tuple[str, int]:
         UnsupportedError: for an operation that has no vector form.
     """
     before, statements, shared = _vector_form(f)
+    linkage = 'static inline __attribute__((always_inline))' if inline else 'static'
     return '\n'.join([
         f'static void {prepare}(const vd *p, vd *s)\n{{',
         *before,
-        f'}}\nstatic inline __attribute__((always_inline)) void {name}(const vd *x, const vd *u,'
+        f'}}\n{linkage} void {name}(const vd *x, const vd *u,'
         ' const vd *s, vd *dx)\n{',
         *statements,
         '}',

@@ -47,8 +47,8 @@ static int length_of(unsigned steps, int done)
     return length;
 }
 
-/* The columns, and how many there are. */
-static int columns_of(const int *place, int late, Column *all)
+/* All columns of a window; their number is the caller's. */
+static void columns_of(const int *place, int late, Column *all)
 {
     const int (*by)[3] = window_model.by_free;
     int n = 0;
@@ -59,11 +59,10 @@ static int columns_of(const int *place, int late, Column *all)
         if (place[f] >= 0) all[n++] = (Column){place[f], entries, 0, by};
         by += entries;
     }
-    if (late < 0) return n;
+    if (late < 0) return;
     int entries = 0;
     while (window_model.by_input[entries][1] < NU) entries++;
-    all[n++] = (Column){late, entries, 1, window_model.by_input};
-    return n;
+    all[n] = (Column){late, entries, 1, window_model.by_input};
 }
 
 /* h seconds of the state and its sensitivities in place, each window by the steps that its rollout
