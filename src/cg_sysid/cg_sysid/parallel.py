@@ -8,6 +8,7 @@ Where the thread that waits keeps a deadline (deadline.py), it waits no longer t
 
 import multiprocessing
 import multiprocessing.context
+import multiprocessing.util
 import os
 import signal
 import sys
@@ -167,6 +168,9 @@ def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
             mp_context=multiprocessing.get_context('spawn') if script else _Modules(),
             initializer=_as_worker,
         )
+        # A process that multiprocessing started waits for its own processes before Python ends
+        # their pool: it would wait for ever.
+        multiprocessing.util.Finalize(None, stop, exitpriority=0)
     return _pool
 
 

@@ -61,13 +61,33 @@ if __name__ == '__main__':
     print(run_all(math.sqrt, [(4.0,), (9.0,)], workers=2))
     print(run_all(cube, [(2.0,), (3.0,)], workers=2))
 """
+# Work that lasts: both workers are there when it ends.
+IN_A_PROCESS = """
+from cg_sysid.parallel import run_all
+import multiprocessing
+import time
+def work():
+    print(run_all(time.sleep, [(1.0,), (1.0,)], workers=2), flush=True)
+if __name__ == '__main__':
+    process = multiprocessing.get_context('spawn').Process(target=work)
+    process.start()
+    process.join(50.0)
+    print(process.exitcode)
+    process.kill()
+"""
 
 
 @pytest.mark.parametrize(
     ('text', 'said'),
-    [(SCRIPT, 'once\n[2.0, 3.0]\n'), (GUARDED, '[2.0, 3.0]\n[8.0, 27.0]\n')],
+    [
+        (SCRIPT, 'once\n[2.0, 3.0]\n'),
+        (GUARDED, '[2.0, 3.0]\n[8.0, 27.0]\n'),
+        (IN_A_PROCESS, '[None, None]\n0\n'),
+    ],
 )
-def test_a_plain_script_needs_no_guard_and_may_have_functions_of_its_own(text, said, tmp_path):
+def test_a_script_needs_no_guard_and_may_have_functions_and_processes_of_its_own(
+    text, said, tmp_path
+):
     (tmp_path / 'script.py').write_text(text)
     done = subprocess.run(
         [sys.executable, 'script.py'], cwd=tmp_path, capture_output=True, text=True,
