@@ -29,6 +29,7 @@ and its time is that of a clock; with `--cores 1` it is CPU time.
 import argparse
 import hashlib
 import json
+import multiprocessing
 import os
 import re
 import sys
@@ -52,6 +53,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_interfaces import channels
+from cg_sysid import parallel
 from cg_sysid.checks.loading import load_bags
 from cg_sysid.cli.new_robot import template
 from cg_sysid.deadline import Deadline
@@ -252,9 +254,11 @@ def run(case: Case, version: str, limit: float, cores: int) -> dict[str, Any]:
             about |= answer(model, bags, limit, cores)
         except Exception:  # what a diagnosis dies of is a wrong answer, not the bench's end
             about |= {'verdict': 'failed', 'why': traceback.format_exc(limit=-4)}
-    return about | {
-        'cpu_s': round(cpu_seconds() - cpu, 1), 'wall_s': round(time.monotonic() - wall, 1),
-    }  # fmt: skip
+    wall = time.monotonic() - wall
+    parallel.stop()
+    for worker in multiprocessing.active_children():
+        worker.join()  # what it spent counts from then on
+    return about | {'cpu_s': round(cpu_seconds() - cpu, 1), 'wall_s': round(wall, 1)}
 
 
 def answer(model: Path, bags: list[Path], limit: float, cores: int) -> dict[str, Any]:

@@ -33,9 +33,33 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
                 task, effects, title, beaten, work.selection.to_be_earned(base),
                 base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
-        comparison = work.selection.compare(base, outcomes)
+        comparison = less_shapes(work, work.selection.compare(base, outcomes))
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
+
+
+def less_shapes(work: Workspace, comparison: Comparison) -> Comparison:
+    """Without those candidates that only give the law of a cause another shape.
+
+    Friction that turns otherwise than its law says leaves something that a second law of friction
+    there can take, with numbers that no record determines. It is not a second cause.
+    """
+    base = comparison.base
+    laws = {
+        (effect.family, effect.at): label
+        for label in sorted(work.added(base))
+        if (effect := base.model.effect(label)).family
+    }
+    for candidate, o in comparison.ranked:
+        tried = next((e for e in o.model.effects if e.label == candidate.label), None)
+        cause = laws.get((tried.family, tried.at)) if tried else None
+        loose = [n for n in o.train.undetermined if n.startswith(f'{candidate.label}.')]
+        if cause and cause != candidate.label and loose and not candidate.reason:
+            comparison = comparison.less(
+                candidate.label, f'{loose[0]} is not determined: it gives the law of {cause} '
+                'another shape'
+            )  # fmt: skip
+    return comparison
 
 
 def worth_a_look(work: Workspace, base: Outcome) -> Effects:
@@ -78,8 +102,15 @@ def led_deeper(
 
 
 def done(work: Workspace, o: Outcome) -> bool:
-    """Whether there is nothing to look for on top of this."""
-    return (settled(o) and not work.selection.imitated(o)) or work.selection.nothing_material(o)
+    """Whether there is nothing to look for on top of this.
+
+    The law of a cause, too, is drawn roughly: where it is there, what comes to the noise with
+    small faults need not be as white as where there is none.
+    """
+    if work.selection.nothing_material(o):
+        return True
+    rough = bool(work.added(o)) and work.selection.whiteness(o) > settings.NOISE.half_white
+    return settled(o) and (rough or not work.selection.imitated(o))
 
 
 def alone(work: Workspace, base: Outcome) -> Task:

@@ -15,7 +15,7 @@ from cg_dynamics.rig import Setup
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
+from cg_sysid.identification.identify import HORIZONS, Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
 from cg_sysid.search import excerpt as excerpt
 from cg_sysid.search import settings
@@ -500,12 +500,13 @@ def _screened(
     length: float | None = None,
     at: Mapping[str, float] | None = None,
     iterations: int = settings.SCREENING.iterations,
+    horizon: float | None = None,
 ) -> Fit:
     """A fit to an excerpt of the records: as long as the base's own look, if there is one."""
     few = [train[i] for i in excerpt.few(train)]
+    usual = task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0]
     return fit(
-        model, few, only,
-        horizon=task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0],
+        model, few, only, horizon=horizon or usual,
         iterations=iterations, start=start, at=at,
         own=task.events, bounds=task.bounds, reach=task.reach, sure=False, company=True,
     )  # fmt: skip
@@ -564,7 +565,13 @@ def _all_screened(
     only = [name for name in moved if name not in kept] if kept else None
     led = _by_torque(task, starts, train, only)
     if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
-        heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
+        # Where torques do not lead the way the first half second tells good starts from bad.
+        led_by_torque = torque_error.tells_all(starts[0][0])
+        heats = (
+            _short_fits(task, led, train, only, settings.SCREENING.heat)
+            if led_by_torque
+            else _short_fits(task, led, train, only, settings.SCREENING.elastic_heat, HORIZONS[0])
+        )
         ahead = heats[: settings.SCREENING.followed]
         if ahead[0][0].normalised_error > settings.SCREENING.hopeless * task.reach:
             return [(found, model.with_values(_numbers(found))) for found, model in ahead]
@@ -581,8 +588,17 @@ def _short_fits(
     train: Sequence[DataSet],
     only: Sequence[str] | None,
     iterations: int,
+    horizon: float | None = None,
 ) -> list[tuple[Fit, Model]]:
     """Fits to an excerpt, with the models they set out from, best first.
+
+    Args:
+        task: What is looked at.
+        starts: From where.
+        train: Prepared records.
+        only: As of `identify.fit`.
+        iterations: Of each fit.
+        horizon: s of each record; by default those of the base's own look.
 
     Raises:
         IdentificationError: none of them can be simulated.
@@ -590,9 +606,10 @@ def _short_fits(
     found = []
     for (model, start), at in starts:
         try:
-            found.append(
-                (_screened(task, model, train, only, start, at=at, iterations=iterations), model)
+            screened = _screened(
+                task, model, train, only, start, at=at, iterations=iterations, horizon=horizon
             )
+            found.append((screened, model))
         except IdentificationError as error:
             failure = error
     if not found:

@@ -18,6 +18,7 @@ class Screening:
         fewest_records: Short records from each set-up, at least.
         iterations: Of a first look.
         heat: Of these, those that all starts of a candidate are given.
+        elastic_heat: The same, to the first half second, where a rotor moves by itself.
         hopeless: Times the error that matters, beyond which a candidate is given no more of them.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.
@@ -31,6 +32,7 @@ class Screening:
     fewest_records: int = 6
     iterations: int = 16
     heat: int = 3
+    elastic_heat: int = 8
     hopeless: float = 100.0
     most_starts: int = 24
     followed: int = 3
@@ -64,7 +66,8 @@ class Noise:
         much_wrong: From here on much is wrong with a model.
         quietest: Of an output of which nothing is wrong, at least.
         white: Share of independent samples from which a residual counts as white noise, [1].
-        half_white: The same beside a law that sound machines follow, which is drawn roughly.
+        half_white: The same beside a cause or a law that sound machines follow: such laws are
+            drawn roughly.
     """
 
     at_noise: float = 1.3

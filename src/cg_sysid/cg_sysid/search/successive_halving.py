@@ -224,7 +224,8 @@ class SuccessiveHalving:
             what: For the progress.
 
         Returns:
-            A fit of the base alone to go on from, if one lies deeper than its own.
+            A fit of the base alone to go on from, if one lies deeper than its own. Not one that
+            is hopeless beside the best look: what is missing there is an effect.
         """
         if base.first is None:
             return None
@@ -243,6 +244,10 @@ class SuccessiveHalving:
             found += filter(None, self.carry_out(deeper, arguments, f'{what}, and without them'))
             if any(fit.normalised_error < settings.NOISE.settled for fit in found):
                 break
+        looks = [s for task in light if isinstance(s := self.screenings.get(_structure(task)),
+                                                   Screening)]  # fmt: skip
+        limit = settings.SCREENING.hopeless * _smallest(looks)
+        found = [fit for fit in found if fit.normalised_error < limit]
         return min(found, key=lambda fit: fit.normalised_error, default=None)
 
     def forget(self, base: Task) -> None:

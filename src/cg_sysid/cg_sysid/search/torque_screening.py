@@ -44,7 +44,8 @@ FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
 FITTED = 16  # candidates that are fitted by torque, the best first
 STARTS = 4  # of each, from which they are fitted, the best first
-KEPT = 8  # of these, that are looked at
+KEPT = 8  # of these, that are looked at, at least
+LOOKS = 32  # and so many over the number of joints: looks at robots of few joints are cheap
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 WORST = 2  # joints on which effects with states are looked at
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
@@ -81,10 +82,11 @@ class Scores:
         promised = {c: max(gain, self.gains[c]) for c, gain in self.fitted.items()}
         ordered = sorted(promised, key=lambda c: -promised[c])
         best = promised[ordered[0]] if ordered else 0.0
+        kept = max(KEPT, LOOKS // len(self.worst))
         seen = sensed | {
             c
             for place, c in enumerate(ordered)
-            if promised[c] > SEEN and (place < KEPT or promised[c] > NEAR * best)
+            if promised[c] > SEEN and (place < kept or promised[c] > NEAR * best)
         }
         unseen = {
             (name, at)
@@ -134,6 +136,12 @@ def scores(
     problems = torque_error.problems_of(plain, train, unknowns)
     if fitted is None or not problems:
         return None
+    # While its scale followed what it left, it stopped short of the minimum at its last one; and
+    # whatever is put on top of it would seem to gain the rest.
+    settled = torque_error.fit_by_torque(
+        model, train, None, bounds, scale=fitted.scale, at=fitted.values
+    )
+    fitted = settled or fitted
     theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     tolerance = np.array([u.tolerance for u in unknowns])
