@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
+from cg_sysid.diagnosis import comparing
+from cg_sysid.diagnosis.comparing import done, less_shapes
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, try_candidate
@@ -53,3 +56,55 @@ def test_a_rival_beyond_the_margin_takes_the_place(search):
 
 def test_what_is_not_earned_goes_for_what_is(search):
     assert _contested(search, -50.0, 'evidence 3 nats, 10 needed').label == RIVAL
+
+
+@pytest.mark.parametrize(('white', 'ends'), [(0.6, True), (0.4, False)])
+def test_beside_a_cause_half_white_is_white_enough(search, monkeypatch, white, ends):
+    work, base, own, _ = search
+    monkeypatch.setattr(comparing, 'settled', lambda o: True)
+    monkeypatch.setattr(work.selection, 'imitated', lambda o: True)
+    monkeypatch.setattr(work.selection, 'whiteness', lambda o: white)
+    monkeypatch.setattr(work.selection, 'nothing_material', lambda o: False)
+    assert done(work, own) == ends
+    # Where no cause is there, small faults have to come to white noise.
+    there = replace(own, model=base.model)
+    assert not done(work, there)
+
+
+def test_what_gives_the_law_of_a_cause_another_shape_is_no_second_cause(search):
+    """Nothing fades near standstill: how it fades is not determined."""
+    work, base, _, _ = search
+    lossy, other = (
+        try_candidate(Task(base.model, (name, None), iterations=2), work.train, work.held)
+        for name in ('quadratic_friction', 'payload')
+    )
+    for cause, told in ((lossy, True), (other, False)):
+        faded = try_candidate(
+            Task(cause.model, ('stribeck_friction', None), iterations=2), work.train, work.held
+        )
+        comparison = work.selection.compare(cause, [faded])
+        ((candidate, _),) = comparison.ranked
+        earned = replace(comparison, ranked=((replace(candidate, reason=''), faded),))
+        # A law of the same kind at the same joint; a load is none.
+        loose = 'stribeck_friction.stribeck_rate' in faded.train.undetermined
+        reason = less_shapes(work, earned).ranked[0][0].reason
+        assert ('gives the law of quadratic_friction another shape' in reason) == (told and loose)
+        assert loose
+
+
+def test_a_second_law_whose_numbers_are_known_may_be_a_second_cause(search):
+    work, base, _, _ = search
+    lossy = try_candidate(
+        Task(base.model, ('quadratic_friction', None), iterations=2), work.train, work.held
+    )
+    faded = try_candidate(
+        Task(lossy.model, ('stribeck_friction', None), iterations=2), work.train, work.held
+    )
+    known = replace(
+        faded, train=replace(faded.train, covariance=np.zeros_like(faded.train.covariance))
+    )
+    assert not known.train.undetermined
+    comparison = work.selection.compare(lossy, [known])
+    ((candidate, _),) = comparison.ranked
+    earned = replace(comparison, ranked=((replace(candidate, reason=''), known),))
+    assert less_shapes(work, earned) is earned

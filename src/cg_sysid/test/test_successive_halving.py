@@ -185,6 +185,12 @@ def test_a_base_is_led_out_of_a_local_minimum(nominal):
     # The first seconds fit, all of the record does not: from there it is tried again.
     lost = replace(alone, base=replace(alone.base, mse=4 * alone.base.mse))
     assert halving.lead_deeper(lost, effects, 'a fit that got lost') is alone.first
+    # Where an effect leaves a hundredth of what the base does, that is what is missing.
+    far = 0.9 * warm_start.normalised_error / settings.SCREENING.hopeless
+    halving.screenings = {k: replace(look, error=far) for k, look in halving.screenings.items()}
+    assert (
+        halving.lead_deeper(replace(alone, first=stuck), effects, 'an effect is missing') is None
+    )
 
 
 def _one_after_the_other(function, arguments, what):

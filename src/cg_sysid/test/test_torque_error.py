@@ -10,6 +10,7 @@ from cg_dynamics.rig import Setup
 from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.diagnose import Options, diagnose
 from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque, tells_all
@@ -153,6 +154,38 @@ def test_a_law_of_torque_that_gains_most_drives_out_no_delay_and_no_sensor():
     # Beside a better sensor a poorer one is not worth a look; alone it is.
     found = Scores(gains | {off: 0.0}, {constant: 280.0}, ('hip_joint',))
     assert found.worth(list(gains)) == [constant, late, bent]
+
+
+@pytest.mark.parametrize(('joints', 'looks'), [(2, 16), (3, 10), (6, KEPT)])
+def test_of_few_joints_more_candidates_are_looked_at(joints, looks):
+    names = tuple(f'joint_{k}' for k in range(joints))
+    laws = {('coulomb_friction', f'joint_{k}'): 30.0 - 0.1 * k for k in range(20)}
+    best = ('torque_constant', None)
+    fitted = laws | {best: 200.0}
+    kept = Scores(dict.fromkeys(fitted, 0.0), fitted, names).worth(list(fitted))
+    assert kept == [*list(laws)[: looks - 1], best]
+
+
+def test_a_base_that_stopped_short_lets_nobody_gain_by_that(believed, monkeypatch):
+    """What any candidate would gain is what the base left for itself."""
+    train = data(believed.with_values(OFF), believed)
+    candidates = [('asymmetric_friction', 'hip_joint'), ('torque_bias', 'thigh_joint')]
+    whole = torque_error.fit_by_torque
+
+    def short(model, data_sets, only, bounds, scale=None, at=None):
+        found = whole(model, data_sets, only, bounds, scale, at)
+        if scale is not None:
+            return found
+        # Where friction of the shank is still far from what it comes to.
+        name = 'viscous_friction@shank_joint.coefficient'
+        values = found.values | {name: found.values[name] + 0.05}
+        with monkeypatch.context() as patch:
+            patch.setattr(torque_error, 'ITERATIONS', 0)
+            return whole(model, data_sets, only, bounds, found.scale, values)
+
+    settled = scores(believed, train, candidates, {}).fitted
+    monkeypatch.setattr(torque_error, 'fit_by_torque', short)
+    assert scores(believed, train, candidates, {}).fitted == pytest.approx(settled, abs=0.5)
 
 
 def test_a_load_and_its_link_are_known_together_and_count_together(believed):
