@@ -73,6 +73,17 @@ class Parameter:
         """This declaration for a joint that slides."""
         return replace(self, unit=self.along or sliding_unit(self.unit))
 
+    def of_size(self, inertia: float) -> 'Parameter':
+        """This declaration where a drive has to turn so many kg m^2 (kg), and not one.
+
+        At the same accelerations and frequencies, torques, stiffness and inertias follow it. The
+        range stays.
+        """
+        if not self.unit.startswith(('N', 'kg')):
+            return self
+        starts = (min(max(inertia * x, self.lower), self.upper) for x in self.starts)
+        return replace(self, starts=tuple(dict.fromkeys(starts)), scale=inertia * self.scale)
+
     @property
     def default(self) -> float:
         """Value used when a file names the effect but not this parameter."""

@@ -165,6 +165,10 @@ class Effect:
         usual = sites[0] if mechanism.dimensions == 2 or len(sites) == 1 else None
         self.at = None if self.site == usual else self.site
         self.parameters = self.parameters_in(mechanism)  # type: ignore[misc]
+        if self.states and self.site in mechanism.all_joints:
+            # Torques tell nothing of where such an effect may set out: the joint's size does.
+            size = mechanism.inertia_at(self.site)
+            self.parameters = tuple(p.of_size(size) for p in self.parameters)  # type: ignore[misc]
         if self.slides(mechanism):
             self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
 

@@ -84,6 +84,13 @@ class Mechanism(ABC):
             share and q in self.sliding for q, share in zip(self.coordinates, row, strict=True)
         )
 
+    def inertia_at(self, joint: str) -> float:
+        """What a drive has to turn at a joint, kg m^2 (kg): where its effects set out follows it.
+
+        About one for the mechanisms of this project, whose effects state their starts as such.
+        """
+        return 1.0
+
     @property
     def input_units(self) -> tuple[str, ...]:
         """Unit of each input: N m on a joint that turns, N on one that slides."""

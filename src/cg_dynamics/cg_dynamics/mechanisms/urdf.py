@@ -49,6 +49,7 @@ NUMBERS = (
 )  # fmt: skip
 THINNEST = 1e-3  # m, radius of gyration of a body that has none in its URDF
 ROUNDED = 0.02  # share by which a principal moment may exceed the sum of the others by rounding
+POSES, POSES_WITHIN = 16, 1.5  # poses for a mean inertia, and how far from zero, rad (m)
 PROBES = 40  # motions at which the numbers are looked at that could matter
 DETERMINED = 1e-8  # relative size of what a motion has to show of a number
 
@@ -106,6 +107,21 @@ class Urdf(Mechanism):
             Parameter('gravity', 'm/s^2', 'acceleration of gravity', 0.0, 30.0, 9.81, free=False),
         )
         self.parameters = self._determined()
+
+    def inertia_at(self, joint: str) -> float:
+        """By the URDF, the mean over some poses."""
+        row = np.array(self.all_joints[joint])
+        return float(row @ self._inertia @ row)
+
+    @cached_property
+    def _inertia(self) -> np.ndarray:
+        """Mean of the mass matrix over some poses, shape (n, n)."""
+        q, n = ca.SX.sym('q', len(self.coordinates)), len(self.coordinates)
+        numbers = {p.name: ca.SX(p.default) for p in self.parameters}
+        matrix = ca.Function('mass_matrix', [q], [self.mass_matrix(q, numbers)])
+        random = np.random.default_rng(0)
+        poses = (random.uniform(-POSES_WITHIN, POSES_WITHIN, n) for _ in range(POSES))
+        return np.mean([np.asarray(matrix(pose)) for pose in poses], axis=0)
 
     def told(self, joint: str) -> tuple[str, ...]:
         """What a drive is told that follows positions."""
