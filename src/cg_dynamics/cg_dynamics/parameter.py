@@ -77,12 +77,17 @@ class Parameter:
         """This declaration where a drive has to turn so many kg m^2 (kg), and not one.
 
         At the same accelerations and frequencies, torques, stiffness and inertias follow it. The
-        range stays.
+        range becomes wider only.
         """
         if not self.unit.startswith(('N', 'kg')):
             return self
-        starts = (min(max(inertia * x, self.lower), self.upper) for x in self.starts)
-        return replace(self, starts=tuple(dict.fromkeys(starts)), scale=inertia * self.scale)
+        return replace(
+            self,
+            lower=min(self.lower, inertia * self.lower),
+            upper=max(self.upper, inertia * self.upper),
+            starts=tuple(inertia * x for x in self.starts),
+            scale=inertia * self.scale,
+        )
 
     @property
     def default(self) -> float:

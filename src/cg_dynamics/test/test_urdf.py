@@ -197,6 +197,39 @@ def test_friction_acts_at_a_joint_without_a_drive_and_what_a_drive_does_acts_at_
             some.with_effect(name, 'joint_2')
 
 
+def test_what_a_drive_has_to_turn_sets_where_effects_set_out():
+    """The rod about its pivot by Steiner, 0.031 + 1.2 (0.02^2 + 0.3^2); a slide moves masses."""
+    rod = robot(PENDULUM).mechanism
+    size = 0.031 + 1.2 * (0.02**2 + 0.3**2)
+    assert rod.inertia_at('pivot') == pytest.approx(size, rel=1e-12)
+    starts, scales = (
+        {p.name: getattr(p, what) for p in LIBRARY['joint_flexibility'](rod).parameters}
+        for what in ('starts', 'scale')
+    )
+    legs = {p.name: p for p in LIBRARY['joint_flexibility'].parameters}
+    for name, p in legs.items():
+        np.testing.assert_allclose(starts[name], size * np.array(p.starts), rtol=1e-12)
+        assert scales[name] == pytest.approx(size * p.scale)
+    (stiffness, *_) = LIBRARY['joint_flexibility'](rod).parameters
+    ends = size * legs['stiffness'].lower, legs['stiffness'].upper
+    assert (stiffness.lower, stiffness.upper) == pytest.approx(ends)
+    # Times and shares are as they were; what torques lead needs no size.
+    lag, friction = (LIBRARY[n](rod) for n in ('actuator_lag', 'coulomb_friction'))
+    assert lag.parameters == LIBRARY['actuator_lag'].parameters
+    assert friction.parameters[0].starts == LIBRARY['coulomb_friction'].parameters[0].starts
+    limit = '<limit effort="1" velocity="1" lower="-1" upper="1"/>'
+    text = PENDULUM.replace('continuous', 'prismatic').replace('<axis', f'{limit}<axis')
+    slide = robot(text).mechanism
+    assert slide.inertia_at('pivot') == pytest.approx(1.2, rel=1e-12)
+    # Where another joint moves what a joint carries, the mean over its poses lies between.
+    arm = robot(random_tree(5, 2)).mechanism
+    poses = np.random.default_rng(1).uniform(-3, 3, (200, 2))
+    q = ca.SX.sym('q', 2)
+    matrix = ca.Function('m', [q], [arm.mass_matrix(q, nominal(arm))])
+    own = [np.asarray(matrix(pose))[0, 0] for pose in poses]
+    assert min(own) < arm.inertia_at(arm.coordinates[0]) < max(own)
+
+
 def test_equal_robots_are_one():
     a, b, other = (Urdf(parse(random_tree(seed, 2))) for seed in (3, 3, 4))
     assert a == b

@@ -1,6 +1,6 @@
 """First-order lag of the motor's torque."""
 
-from cg_dynamics.effects.effect import START_TORQUE, Effect
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -31,4 +31,4 @@ class ActuatorLag(Effect):
 
     def start_spreads(self, p):
         """Commands of a moment before may still be on."""
-        return [START_TORQUE]
+        return [self.start_torque]

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from cg_dynamics.effects.effect import START_TORQUE, Effect
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -71,6 +71,6 @@ class Backlash(Effect):
         return [angle + side * p['gap'] / 2 + torque / p['stiffness'], rate]
 
     def start_spreads(self, p):
-        """On that flank still: wound up by START_TORQUE more or less, in energy as in motion."""
+        """On that flank still: wound up by `start_torque` more or less, in energy as in motion."""
         natural = ca.sqrt(p['stiffness'] * p['rotor_inertia'])
-        return [START_TORQUE / p['stiffness'], START_TORQUE / natural]
+        return [self.start_torque / p['stiffness'], self.start_torque / natural]

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from cg_dynamics.effects.effect import START_TORQUE, Effect
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
 
@@ -61,6 +61,6 @@ class JointFlexibility(Effect):
         return [angle + torque / p['stiffness'], rate]
 
     def start_spreads(self, p):
-        """Wound up by START_TORQUE more or less, and as much energy in the rotor's motion."""
+        """Wound up by `start_torque` more or less, and as much energy in the rotor's motion."""
         natural = ca.sqrt(p['stiffness'] * p['rotor_inertia'])
-        return [START_TORQUE / p['stiffness'], START_TORQUE / natural]
+        return [self.start_torque / p['stiffness'], self.start_torque / natural]

@@ -566,12 +566,12 @@ def _all_screened(
     led = _by_torque(task, starts, train, only)
     if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
         # Where torques do not lead the way the first half second tells good starts from bad.
-        led_by_torque = torque_error.tells_all(starts[0][0])
-        heats = (
-            _short_fits(task, led, train, only, settings.SCREENING.heat)
-            if led_by_torque
-            else _short_fits(task, led, train, only, settings.SCREENING.elastic_heat, HORIZONS[0])
+        heat = (
+            (settings.SCREENING.heat, None)
+            if torque_error.tells_all(starts[0][0])
+            else (settings.SCREENING.iterations, HORIZONS[0])
         )
+        heats = _short_fits(task, led, train, only, *heat)
         ahead = heats[: settings.SCREENING.followed]
         if ahead[0][0].normalised_error > settings.SCREENING.hopeless * task.reach:
             return [(found, model.with_values(_numbers(found))) for found, model in ahead]

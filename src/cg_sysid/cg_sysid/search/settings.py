@@ -17,8 +17,8 @@ class Screening:
         enough_s: Length of short records that is enough, all together, in s.
         fewest_records: Short records from each set-up, at least.
         iterations: Of a first look.
-        heat: Of these, those that all starts of a candidate are given.
-        elastic_heat: The same, to the first half second, where a rotor moves by itself.
+        heat: Of these, those that all starts of a candidate are given, where no rotor moves by
+            itself: there all, to the first half second.
         hopeless: Times the error that matters, beyond which a candidate is given no more of them.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.
@@ -32,7 +32,6 @@ class Screening:
     fewest_records: int = 6
     iterations: int = 16
     heat: int = 3
-    elastic_heat: int = 8
     hopeless: float = 100.0
     most_starts: int = 24
     followed: int = 3
