@@ -18,6 +18,7 @@ from cg_sysid.identification.simulation_error import (
     reduced,
     solve,
 )
+from cg_sysid.identification.uncertainty import _widening
 from cg_sysid.identification.unknowns import unknowns_of
 
 
@@ -108,3 +109,10 @@ def test_a_curvature_that_rounding_turned_is_solved_at_once():
     a[0, 0] = -9e22
     x = solve(a, np.column_stack([column, np.ones(5)]))
     assert np.isfinite(x).all()
+
+
+def test_the_sandwich_widens_only_what_the_curvature_tells():
+    """Of the second number the curvature tells nothing; the third it tells too surely."""
+    inverse, sandwich = np.diag([4.0, 0.0, 1e-12]), np.diag([1.0, 1e280, 9e-12])
+    with np.errstate(all='raise'):
+        assert _widening(sandwich, inverse) == pytest.approx([1.0, 1.0, 3.0])

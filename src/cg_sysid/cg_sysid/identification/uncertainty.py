@@ -68,8 +68,13 @@ def _of_shared(
 
 
 def _widening(sandwich: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Standard deviations by the sandwich over those by curvature, where they are larger."""
-    return np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(inverse), 1e-300), 1.0))
+    """Standard deviations by the sandwich over those by curvature, where they are larger.
+
+    1 for what the curvature does not tell at all: its variance is not taken from here.
+    """
+    curvature = np.diag(inverse)
+    told = curvature > np.finfo(float).tiny
+    return np.sqrt(np.maximum(np.diag(sandwich) / np.where(told, curvature, np.inf), 1.0))
 
 
 def not_asked(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
