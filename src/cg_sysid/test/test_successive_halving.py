@@ -11,7 +11,7 @@ from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.search import settings
+from cg_sysid.search import candidates, settings
 from cg_sysid.search.candidates import (
     Task,
     events_of,
@@ -195,6 +195,27 @@ def test_a_base_is_led_out_of_a_local_minimum(nominal):
 
 def _one_after_the_other(function, arguments, what):
     return [function(*a) for a in arguments]
+
+
+@pytest.mark.parametrize(('error', 'followed'), [(1.11, True), (3.5, False)])
+def test_a_start_near_the_noise_is_followed_whatever_the_reach(
+    nominal, monkeypatch, error, followed
+):
+    """Where only beliefs are at stake the reach is a hair above the noise, and looks are rough."""
+    train = _data_sets(nominal, _machine(nominal), 2.0)
+    found = fit(nominal.with_effect('payload'), train, iterations=2)
+    starts = tuple(replace(found, mse=np.full_like(found.mse, e)) for e in (1.06, error))
+    tried = []
+
+    def whole(task, model, train, start, iterations):
+        tried.append(start.normalised_error)
+        return replace(start, converged=True)
+
+    monkeypatch.setattr(candidates, '_whole', whole)
+    monkeypatch.setattr(candidates, 'far', lambda fitted, bounds: {'leg_mass': 4.9})
+    task = Task(nominal, ('payload', None), warm_starts=starts, reach=1.07)
+    candidates._own_fit(task, train)
+    assert tried == pytest.approx([1.06, error][: 1 + followed])
 
 
 def test_what_explains_next_to_nothing_of_what_is_above_the_noise(nominal):

@@ -371,7 +371,8 @@ def _own_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     for warm_start in warm_starts[1:]:
         # What comes to the noise with numbers that nobody believes has a rival in beliefs.
         done = best.normalised_error < settings.NOISE.settled and not far(best, task.bounds)
-        if done or warm_start.normalised_error > task.reach:
+        # A look is a quick fit: near the noise it may still come there, whatever the reach.
+        if done or warm_start.normalised_error > max(task.reach, settings.NOISE.quick):
             break
         other = _whole(
             task, _chosen(model, warm_start), train, warm_start, settings.SCREENING.following
