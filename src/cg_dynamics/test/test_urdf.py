@@ -9,6 +9,7 @@ from cg_description.model_file import ModelFile
 from cg_description.robot_description import parse, with_inertials
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.effects import LIBRARY, make_effect
+from cg_dynamics.effects.effect import START_TORQUE
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import mechanism
 from cg_dynamics.mechanisms.urdf import Urdf
@@ -221,6 +222,8 @@ def test_what_a_drive_has_to_turn_sets_where_effects_set_out():
     text = PENDULUM.replace('continuous', 'prismatic').replace('<axis', f'{limit}<axis')
     slide = robot(text).mechanism
     assert slide.inertia_at('pivot') == pytest.approx(1.2, rel=1e-12)
+    torques = [LIBRARY['joint_flexibility'](body).start_torque for body in (rod, slide)]
+    assert torques == pytest.approx([START_TORQUE * size**0.8, START_TORQUE * 1.2])
     # Where another joint moves what a joint carries, the mean over its poses lies between.
     arm = robot(random_tree(5, 2)).mechanism
     poses = np.random.default_rng(1).uniform(-3, 3, (200, 2))

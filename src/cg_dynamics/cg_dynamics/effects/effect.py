@@ -135,7 +135,7 @@ class Effect:
         ripple: True where its slope changes sign within small motions, so that the slope at one
             state tells nothing of those around it.
         at: Joint, body or sensor where this instance acts; None where there is only one.
-        start_torque: START_TORQUE at a joint of this size.
+        start_torque: START_TORQUE at a joint of this size, N m (N where it slides).
     """
 
     name: ClassVar[str]
@@ -171,8 +171,9 @@ class Effect:
             # Torques tell nothing of where such an effect may set out: the joint's size does.
             size = mechanism.inertia_at(self.site)
             self.parameters = tuple(p.of_size(size) for p in self.parameters)  # type: ignore[misc]
-            # Of bodies of one shape and density inertia grows as l^5, torque of gravity as l^4.
-            self.start_torque *= size**0.8
+            # Of bodies of one shape and density inertia grows as l^5, torque of gravity as l^4;
+            # mass and weight both as l^3.
+            self.start_torque *= size if self.slides(mechanism) else size**0.8
         if self.slides(mechanism):
             self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
 

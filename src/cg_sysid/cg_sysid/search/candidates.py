@@ -498,14 +498,13 @@ def _screened(
     train: Sequence[DataSet],
     only: Sequence[str] | None = None,
     start: Fit | None = None,
-    length: float | None = None,
     at: Mapping[str, float] | None = None,
     iterations: int = settings.SCREENING.iterations,
     horizon: float | None = None,
 ) -> Fit:
     """A fit to an excerpt of the records: as long as the base's own look, if there is one."""
     few = [train[i] for i in excerpt.few(train)]
-    usual = task.first.horizon if task.first else length or settings.SCREENING.lengths_s[0]
+    usual = task.first.horizon if task.first else settings.SCREENING.lengths_s[0]
     return fit(
         model, few, only, horizon=horizon or usual,
         iterations=iterations, start=start, at=at,
@@ -522,7 +521,7 @@ def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
     start = excerpt.to_few(task.base, train) if task.base else None
     for length in excerpt.lengths(train):
         try:
-            found = _screened(task, task.model, train, start=start, length=length)
+            found = _screened(task, task.model, train, start=start, horizon=length)
         except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
             break
         if found.normalised_error > settings.NOISE.settled:
