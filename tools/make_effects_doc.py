@@ -95,7 +95,9 @@ def page() -> str:
         '',
         'A model file lists the effects that a robot has, in the order in which they act; '
         'diagnosis tries all of them. At the value in the column "vanishes at" the effect is not '
-        'there at all. "Free: no" marks parameters that identification leaves alone unless told; '
+        'there at all. At a joint of a URDF, effects with states start at so many times the '
+        'inertia that it turns, in kg m^2, where the unit has a torque or a mass. '
+        '"Free: no" marks parameters that identification leaves alone unless told; '
         '"shape" those of the shape of a law, which a diagnosis lets go within bounds, '
         '"choice" one that stays at that of its starts which explains most. A new effect is '
         'one class in one file of `src/cg_dynamics/cg_dynamics/effects`.',
