@@ -62,10 +62,21 @@ def alive(pid):
 def waited(pid):
     """Time in s for which the threads of a process were ready and had no core."""
     total = 0
-    for task in Path(f'/proc/{pid}/task').glob('*/schedstat'):
+    for task in threads(pid):
         with contextlib.suppress(OSError):  # it has just ended
-            total += int(task.read_text().split()[1])
+            total += int((task / 'schedstat').read_text().split()[1])
     return 1e-9 * total
+
+
+def threads(pid):
+    """Directories of the threads of a process: none of a process that has ended.
+
+    `Path.glob` passes on the error of a directory that goes between its look and its reading.
+    """
+    try:
+        return list(Path(f'/proc/{pid}/task').iterdir())
+    except OSError:
+        return []
 
 
 def gone_within(seconds, family, spin):
