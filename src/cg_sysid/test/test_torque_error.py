@@ -1,5 +1,6 @@
 """What torques say of a robot before anything is simulated."""
 
+import finger
 import numpy as np
 import pytest
 from hanging_arm import nominal, recorded
@@ -13,7 +14,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque, tells_all
+from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque
 from cg_sysid.identification.windows import followed
 from cg_sysid.search.candidates import (
     Task,
@@ -297,38 +298,18 @@ def ride(machine, k):
     )  # fmt: skip
 
 
-def test_a_fit_with_play_sets_out_over_short_horizons():
+def test_a_fit_with_play_sets_out_from_torques():
     believed = Model.from_text(CART_POLE)
     machine = believed.with_values({'cart_mass': 1.02}).with_effect('backlash', **PLAY)
     data_sets = prepare(believed, [ride(machine, k) for k in range(2)])
-    assert tells_all(believed)
     errors = []
     for start in starts_of(Backlash(believed.mechanism)):
         model = believed.with_effect('backlash', **start)
-        assert not tells_all(model)
         errors.append(fit(model, data_sets).normalised_error)
-    # Noise alone gives 1. The best start comes there; over whole records from the first step on
-    # it comes to 5.2, and half of them stay above 50.
+    # Noise alone gives 1. By simulation alone the best start comes to 5.2, and half of them stay
+    # above 50.
     assert min(errors) < 1.1
     assert np.median(errors) < 10
-
-
-FINGER = """\
-format: cg_model/1
-name: finger
-mechanism: urdf
-robot:
-  urdf: |
-    <robot name="finger"><link name="palm"/>
-    <link name="tip"><inertial><mass value="0.03"/><origin xyz="0.004 0 -0.04"/>
-    <inertia ixx="1.5e-5" iyy="1.6e-5" izz="2e-6" ixy="0" ixz="0" iyz="0"/></inertial></link>
-    <joint name="knuckle" type="continuous"><parent link="palm"/><child link="tip"/>
-    <axis xyz="0 1 0"/></joint></robot>
-effects:
-- {name: viscous_friction, parameters: {coefficient: {value: 2.0e-4, unit: N m s/rad}}}
-sensors:
-  knuckle_position: {noise: {value: 4.0e-4, unit: rad}}
-"""
 
 
 @pytest.mark.parametrize(
@@ -336,20 +317,14 @@ sensors:
     [
         ('joint_flexibility', {'stiffness': 0.05, 'rotor_inertia': 2e-5, 'damping': 3e-4}),
         ('backlash', {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}),
+        ('backlash', {'gap': 0.008, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}),
     ],
 )
 def test_what_a_light_drive_hides_is_found_from_starts_of_its_size(name, hidden):
     """A finger turns 1/15 000 of what a leg does: a spring for that would be rigid here."""
-    believed = Model.from_text(FINGER)
+    believed = finger.finger()
     machine = believed.with_values({'tip_mass': 1.06}).with_effect(name, **hidden)
-    data_sets = prepare(believed, [
-        rehearse(
-            f'record_{k}', machine, Setup(), [0.3 - 0.2 * k, 0.0],
-            [lambda t, k=k: 0.005 * np.sin((9.0 + k) * t) + 0.003 * np.sin((23.0 - k) * t)],
-            4.0, 0.004, k,
-        )
-        for k in range(4)
-    ])  # fmt: skip
+    data_sets = finger.data(machine, 4)
     found = try_candidate(Task(believed, (name, None)), data_sets[:2], data_sets[2:])
     assert found.train.normalised_error < 1.1
     values = found.model.values

@@ -321,7 +321,7 @@ def fit(
     end, trial = _End.of(kept_fits.recall(place)), None
     if end is None:
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
-        if by_torque and torque_error.tells_all(model):
+        if by_torque:
             trial = attempt(problem, theta, motions, longest)
             if trial is not None and trial.point(weight) is not None:
                 stages = []  # the torques have led the way

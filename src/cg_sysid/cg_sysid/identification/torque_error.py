@@ -3,37 +3,48 @@
     r_k = S^-1 (Q(x_k, u_k, p) - ID(q_k, v_k, a_k, p)),   x_k = (q_k, v_k) and a_k measured   (TE)
 
 Nothing is simulated, so that no start is too far off and nothing runs away: an arm of six joints
-is fitted in a second. In return it is biased: derivatives of samples are smoothed, sensors that
-are late or wrong count as right, and states that no sensor reads are left out. So it says where a
-fit by simulation error sets out, and which candidates are worth one (theory.md, ID).
+is fitted in a second. In return it is biased: derivatives of samples are smoothed, and sensors
+that are late or wrong count as right. States that no sensor reads are simulated along the measured
+motion where their joint and its motor are all that moves them (along_motion.py), and left out
+elsewhere. So it says where a fit by simulation error sets out, and which candidates are worth one
+(theory.md, "Torque error").
 
-Position, rate and acceleration come from local polynomials; the torques are averaged with the same
-weights, so that both sides have seen the same window.
+Position, rate and acceleration come from local polynomials. Torques are averaged with the weights
+with which such an acceleration averages the true one, so that both sides have seen the same: of a
+constant inertia (TE) is exact, however fast it moves.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
+from cg_dynamics.effects import Effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_sysid.identification import along_motion
+from cg_sysid.identification.along_motion import AlongMotion, Samples
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
 
 HALF_WIDTH_S = 0.06  # of the window of a local polynomial: motions up to some 5 Hz
+SHORTER = 0.5  # times that and STRIDE_S where a rotor moves by itself, which it does faster
+ENOUGH_S = 10.0  # of all records together, to be followed by a rotor
+MOVING_S = 0.01  # half width of the window of the motion that moves a rotor
 LEAST_HALF_WIDTH = 3  # samples
 DEGREE = 4  # of the polynomial
 STRIDE_S = 0.04  # between rows: windows that share less than half of their samples
 ITERATIONS = 25
+HEAT = 6  # iterations from each of many starts, before the best of them go on
 SETTLED = 1e-4  # relative change of the cost
 DAMPING = 1e-3  # Levenberg-Marquardt, at first
 MOST_DAMPING = 1e6
 PATIENCE = 4  # steps that may gain little where a full one promises more
 STRAINED = 2.5  # tolerances that a value lies off its belief
+RUN_AWAY = 1e6  # standard deviations, in which no state is that moves with its joint
 CAP = 4.0  # standard deviations from which a row counts less: rates that turn within a window
 
 
@@ -48,6 +59,7 @@ class Motion:
         inputs: Averages, shape (k, nu).
         first: Rows with which a record begins, shape (k,).
         setup: The set-up.
+        records: All samples, record by record.
     """
 
     position: np.ndarray
@@ -56,6 +68,7 @@ class Motion:
     inputs: np.ndarray
     first: np.ndarray
     setup: Setup
+    records: tuple[Samples, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,6 +91,13 @@ class TorqueFit:
     rows: int
     scale: np.ndarray
 
+    @property
+    def deviance(self) -> float:
+        """-2 log likelihood, but for a constant: it ranks fits that chose their weights."""
+        if not np.isfinite(self.cost):
+            return np.inf
+        return self.cost + 2 * self.rows * float(np.log(self.scale).sum())
+
 
 def can(model: Model) -> bool:
     """Whether this is of use: a robot of a URDF with an encoder at every joint that moves.
@@ -88,21 +108,21 @@ def can(model: Model) -> bool:
     return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
 
 
-def tells_all(model: Model) -> bool:
-    """Whether, besides, all that acts shows in the torques along the measured motion.
-
-    A rotor behind a gap or a spring moves by itself, and torques say nothing of the gap.
-    """
-    return can(model) and not any(effect.elastic for effect in acting_effects(model))
-
-
-def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion | None:
+def motion_of(
+    model: Model,
+    data_set: DataSet,
+    names: Sequence[str],
+    shorter: float = 1.0,
+    longest: float = np.inf,
+) -> Motion | None:
     """The measured motion of a data set; None where it is too short or samples are missing.
 
     Args:
         model: Its mechanism counts.
         data_set: The record.
         names: Inputs wanted.
+        shorter: Times the usual windows.
+        longest: Only so much of the record, s.
     """
     body = model.mechanism
     kinematics = body.kinematics(data_set.setup)
@@ -111,12 +131,13 @@ def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion |
     count = len(body.coordinates)
     seen = data_set.outputs[:, :count]
     spacing = float(np.median(np.diff(data_set.time)))
-    half = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
-    grid = np.arange(0.0, data_set.duration, spacing)
+    half = max(LEAST_HALF_WIDTH, round(shorter * HALF_WIDTH_S / spacing))
+    grid = np.arange(0.0, min(data_set.duration, longest), spacing)
     if len(grid) <= 2 * half + 1:
         return None
     place, rate, acceleration = (_weights(half, spacing, order) for order in range(3))
-    stride = max(1, round(STRIDE_S / spacing))
+    held = _held(half, spacing)
+    stride = max(1, round(shorter * STRIDE_S / spacing))
     free = np.linalg.pinv(basis)
     angles = []
     for channel in seen.T:
@@ -134,9 +155,24 @@ def motion_of(model: Model, data_set: DataSet, names: Sequence[str]) -> Motion |
 
     position = over(s, place)
     return Motion(
-        position, over(s, rate), over(s, acceleration), over(inputs, place),
+        position, over(s, rate), over(s, acceleration), over(inputs, held),
         np.arange(len(position)) == 0, data_set.setup,
+        (_samples(s, inputs, spacing, held, stride),),
     )  # fmt: skip
+
+
+def _samples(
+    s: np.ndarray, inputs: np.ndarray, spacing: float, weights: np.ndarray, stride: int
+) -> Samples:
+    """All samples of a motion, smoothed as little as its rates allow."""
+    half = max(LEAST_HALF_WIDTH, round(MOVING_S / spacing))
+
+    def along(order: int) -> np.ndarray:
+        own = _weights(half, spacing, order)
+        columns = [np.correlate(column, own, 'valid') for column in s.T]
+        return np.pad(np.column_stack(columns), ((half, half), (0, 0)), 'edge')
+
+    return Samples(along(0), along(1), inputs, spacing, weights, stride)
 
 
 @functools.cache
@@ -146,6 +182,19 @@ def _weights(half: int, spacing: float, order: int) -> np.ndarray:
     design = np.vander(t / t[-1], DEGREE + 1, increasing=True)
     factor = (1.0, 1.0, 2.0)[order] / t[-1] ** order
     return factor * np.linalg.pinv(design)[order]
+
+
+@functools.cache
+def _held(half: int, spacing: float) -> np.ndarray:
+    """Weights of what is held from each sample to the next, beside an acceleration of `_weights`.
+
+    That is a sum of second differences, with other weights: those are its weights summed twice. A
+    second difference of positions is an average of the acceleration over two intervals, to which
+    each of them contributes one half.
+    """
+    summed = np.cumsum(np.cumsum(_weights(half, spacing, 2))) * spacing**2
+    of_differences = np.concatenate([[0.0], summed[:-1], [0.0]])
+    return (of_differences[:-1] + of_differences[1:]) / 2
 
 
 def fit_by_torque(
@@ -178,31 +227,40 @@ def fits_by_torque(
     bounds: Mapping[str, float] | None = None,
     scale: np.ndarray | None = None,
     at: Mapping[str, float] | None = None,
+    followed: int | None = None,
 ) -> list[TorqueFit]:
     """The same for models that differ in their values only, from each; none without a record.
 
-    Those that differ in nothing that the torques see, as in a delay, are fitted once.
+    Those that differ in nothing that the torques see, as in a delay, are fitted once. Of more than
+    `followed` fits the best go on to their minimum, after the first few iterations of all.
     """
-    plain = [without_states(model) for model in models]
-    declared = plain[0].declarations
     unknowns = [
-        tuple(u for u in unknowns_of(model, only, bounds) if u.name in declared)
+        tuple(u for u in unknowns_of(model, only, bounds) if u.name in seen_by_torques(model))
         for model in models
     ]
-    problems = problems_of(plain[0], data_sets, unknowns[0])
+    problems = problems_of(models[0], data_sets, unknowns[0])
     if not problems:
         return []
-    seen = [np.array(ca.which_depends(p.equations.imbalance, p.equations.p)) for p in problems]
+    seen = [p.sees() for p in problems]
     blind = np.logical_and.reduce(
         [~there[p.places] for p, there in zip(problems, seen, strict=True)]
     )
-    fitted: dict[tuple, TorqueFit] = {}
+    starts = [[problem.at(model) for problem in problems] for model in models]
+    keys = [
+        tuple(x for p, there in zip(start, seen, strict=True) for x in p.vector[there])
+        for start in starts
+    ]
+    firsts = {key: keys.index(key) for key in keys}
+    many = followed is not None and len(firsts) > followed
+    fitted = {
+        key: _best(starts[k], unknowns[k], scale, at or {}, HEAT if many else ITERATIONS)
+        for key, k in firsts.items()
+    }
+    for key in sorted(fitted, key=lambda key: fitted[key].deviance)[:followed] if many else ():
+        k = firsts[key]
+        fitted[key] = _descend(starts[k], unknowns[k], scale, fitted[key].values)
     found = []
-    for model, own in zip(plain, unknowns, strict=True):
-        from_here = [problem.at(model) for problem in problems]
-        key = tuple(x for p, there in zip(from_here, seen, strict=True) for x in p.vector[there])
-        if key not in fitted:
-            fitted[key] = _best(from_here, own, scale, at or {})
+    for key, own in zip(keys, unknowns, strict=True):
         # What the torques do not see is left where it was.
         left = {
             u.name: (at or {}).get(u.name, u.prior) for u, b in zip(own, blind, strict=True) if b
@@ -216,20 +274,21 @@ def _best(
     unknowns: Sequence[Unknown],
     scale: np.ndarray | None,
     at: Mapping[str, float],
+    iterations: int,
 ) -> TorqueFit:
     """From given values and, where these strain the belief, from what is believed as well.
 
     What an effect more could take over from strained numbers lies far off, along a curved valley
     of numbers that the torques cannot tell apart.
     """
-    found = _descend(problems, unknowns, scale, at)
+    found = _descend(problems, unknowns, scale, at, iterations)
     strained = any(
         abs(u.to_coordinate(at[u.name]) - u.to_coordinate(u.prior)) > STRAINED * u.tolerance
         for u in unknowns if u.name in at
     )  # fmt: skip
     if not strained:
         return found
-    afresh = _descend(problems, unknowns, found.scale, {})
+    afresh = _descend(problems, unknowns, found.scale, {}, iterations)
     return min(found, afresh, key=lambda fitted: fitted.cost)
 
 
@@ -238,8 +297,12 @@ def _descend(
     unknowns: Sequence[Unknown],
     scale: np.ndarray | None,
     at: Mapping[str, float],
+    iterations: int = ITERATIONS,
 ) -> TorqueFit:
-    """From a start to the minimum: Gauss-Newton, damped."""
+    """From a start to the minimum: Gauss-Newton, damped.
+
+    A start from which a rotor runs away stays where it is, at an infinite cost.
+    """
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     theta = np.array([
         np.clip(u.to_coordinate(at.get(u.name, u.prior)), *_range(u)) for u in unknowns
@@ -251,7 +314,7 @@ def _descend(
         scale = spread_of(residual)
     damping, patience = DAMPING, PATIENCE
     cost = _cost(residual, scale, theta, prior, tolerance)
-    for _ in range(ITERATIONS):
+    for _ in range(iterations if np.isfinite(cost) else 0):
         jacobian = derivatives(problems, unknowns, theta)
         weight = 1 / beyond(residual / scale)
         r = (weight * residual / scale).ravel()
@@ -325,13 +388,14 @@ class Problem:
     """Motions of one set-up, and (TE) along them.
 
     Attributes:
-        equations: Of the model.
-        error: (TE), in one column.
-        slope: Its derivative by the unknowns.
+        equations: Of the model without states.
+        error: (TE) of that, in one column.
+        slope: Its derivative by the unknowns that it has.
         motion: What was measured.
-        vector: Parameters.
+        vector: Parameters: of the model without states, then those of each of `followed`.
         places: Of the unknowns among them.
         acted: Torque that was applied on each free coordinate, shape (k, m).
+        followed: Effects whose states are simulated along the motion.
     """
 
     equations: Equations
@@ -341,23 +405,62 @@ class Problem:
     vector: np.ndarray
     places: list[int]
     acted: np.ndarray
+    followed: tuple[AlongMotion, ...] = ()
 
     def at(self, model: Model) -> 'Problem':
         """The same with the values of a model of this structure."""
-        return replace(self, vector=parameter_vector(model, self.motion.setup))
+        return replace(self, vector=_vector(model, self.motion.setup))
+
+    def sees(self) -> np.ndarray:
+        """Which of the parameters change (TE)."""
+        e = self.equations
+        plain = np.array(ca.which_depends(e.imbalance, e.p))
+        return np.concatenate([plain, np.ones(len(self.vector) - len(plain), bool)])
+
+    def residual(self, vector: np.ndarray) -> np.ndarray:
+        """(TE) of each row with these parameters, shape (k, m)."""
+        plain = self.equations.p.shape[0]
+        found = self.error(vector[:plain])[:, :, 0]
+        for effect, own in self._followed(vector):
+            force, _ = effect(vector[:plain], vector[own])
+            found = found + force[:, None] * effect.direction
+        return found
+
+    def derivative(self, vector: np.ndarray) -> np.ndarray:
+        """Its derivative by the unknowns, shape (k, m, unknowns)."""
+        plain = self.equations.p.shape[0]
+        k, m = self.motion.position.shape
+        found = np.zeros((k, m, len(self.places)))
+        found[:, :, [place < plain for place in self.places]] = self.slope(vector[:plain])
+        for effect, own in self._followed(vector):
+            _, slope = effect(vector[:plain], vector[own])
+            for i, place in enumerate(self.places):
+                if place in range(own.start, own.stop):
+                    found[:, :, i] += slope[:, place - own.start, None] * effect.direction
+        return found
+
+    def _followed(self, vector: np.ndarray) -> Iterator[tuple[AlongMotion, slice]]:
+        """Each of them, and where its parameters are."""
+        first = self.equations.p.shape[0]
+        for effect in self.followed:
+            last = first + len(effect.names)
+            yield effect, slice(first, last)
+            first = last
 
 
 def problems_of(
     model: Model, data_sets: Sequence[DataSet], unknowns: Sequence[Unknown]
 ) -> list[Problem]:
-    """What is measured, by set-up; unknowns are those of a model without states."""
+    """What is measured, by set-up; unknowns are those that torques see (seen_by_torques)."""
+    plain, effects = apart(model)
+    shorter, longest = (SHORTER, ENOUGH_S / len(data_sets)) if effects else (1.0, np.inf)
     by_setup: dict[Setup, list[DataSet]] = {}
     for data_set in data_sets:
         by_setup.setdefault(data_set.setup, []).append(data_set)
     found = []
     for setup, own in by_setup.items():
-        e = assemble(model, setup)
-        motions = [motion_of(model, data_set, e.input_names) for data_set in own]
+        e = assemble(plain, setup)
+        motions = [motion_of(plain, data_set, e.input_names, shorter, longest) for data_set in own]
         usable = [motion for motion in motions if motion is not None]
         if not usable:
             continue
@@ -365,16 +468,31 @@ def problems_of(
             np.vstack([m.position for m in usable]), np.vstack([m.rate for m in usable]),
             np.vstack([m.acceleration for m in usable]), np.vstack([m.inputs for m in usable]),
             np.concatenate([m.first for m in usable]), setup,
+            tuple(samples for m in usable for samples in m.records),
         )  # fmt: skip
-        places = [e.parameter_names.index(u.name) for u in unknowns]
-        moved = ca.vertcat(*(e.p[k] for k in places)) if places else ca.SX(0, 1)
+        basis = np.asarray(plain.mechanism.kinematics(setup).basis)
+        followed = tuple(
+            AlongMotion(plain, effect, e.p, e.parameter_names, e.input_names, basis, every.records)
+            for effect in effects
+        )
+        names = [*e.parameter_names, *(name for effect in followed for name in effect.names)]
+        places = [names.index(u.name) for u in unknowns]
+        own_places = [k for k in places if k < e.p.shape[0]]
+        moved = ca.vertcat(*(e.p[k] for k in own_places)) if own_places else ca.SX(0, 1)
         error, slope = (
             AlongRows(e, every, ca.densify(x))
             for x in (e.imbalance, ca.jacobian(e.imbalance, moved))
         )
-        vector, acted = parameter_vector(model, setup), _acted(model, e, every)
-        found.append(Problem(e, error, slope, every, vector, places, acted))
+        vector, acted = _vector(model, setup), _acted(plain, e, every)
+        found.append(Problem(e, error, slope, every, vector, places, acted, followed))
     return found
+
+
+def _vector(model: Model, setup: Setup) -> np.ndarray:
+    """Parameters of a model without states, then those of the effects that are followed."""
+    plain, effects = apart(model)
+    own = [model.values[f'{e.label}.{q.name}'] for e in effects for q in e.parameters]
+    return np.concatenate([parameter_vector(plain, setup), own])
 
 
 def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
@@ -389,7 +507,7 @@ def residuals(
     problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
 ) -> np.ndarray:
     """(TE) of all rows, shape (rows, m)."""
-    return np.vstack([p.error(_parameters(p, unknowns, theta))[:, :, 0] for p in problems])
+    return np.vstack([p.residual(_parameters(p, unknowns, theta)) for p in problems])
 
 
 def derivatives(
@@ -398,7 +516,7 @@ def derivatives(
     """Its derivative by the coordinates of the unknowns, shape (rows, m, unknowns)."""
     values = [u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)]
     chain = [v if u.logarithmic else 1.0 for v, u in zip(values, unknowns, strict=True)]
-    by_value = [p.slope(_parameters(p, unknowns, theta)) for p in problems]
+    by_value = [p.derivative(_parameters(p, unknowns, theta)) for p in problems]
     return np.vstack(by_value) * np.array(chain)
 
 
@@ -433,8 +551,25 @@ def _cost(
 ) -> float:
     """Squares near zero, straight on beyond CAP (Huber), and the belief."""
     size = np.abs(residual / scale)
+    if not np.all(size < RUN_AWAY):
+        return np.inf
     capped = np.where(size <= CAP, size**2, CAP * (2 * size - CAP))
     return float(capped.sum() + (((theta - prior) / tolerance) ** 2).sum())
+
+
+def apart(model: Model) -> tuple[Model, tuple[Effect, ...]]:
+    """A model without states, and of its effects those that are followed along a motion."""
+    followed = tuple(e for e in acting_effects(model) if along_motion.follows(e))
+    for effect in followed:
+        model = model.without_effect(effect.label)
+    return without_states(model), followed
+
+
+def seen_by_torques(model: Model) -> frozenset[str]:
+    """Full names of the parameters that (TE) may depend on."""
+    plain, followed = apart(model)
+    own = {f'{effect.label}.{q.name}' for effect in followed for q in effect.parameters}
+    return own | frozenset(plain.declarations)
 
 
 def without_states(model: Model) -> Model:

@@ -13,9 +13,9 @@ from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 from cg_sysid.errors import Failure
-from cg_sysid.identification import torque_error
+from cg_sysid.identification import along_motion, torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import HORIZONS, Fit, fit, predict, score, unknowns_of
+from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
 from cg_sysid.search import excerpt as excerpt
 from cg_sysid.search import settings
@@ -565,13 +565,7 @@ def _all_screened(
     only = [name for name in moved if name not in kept] if kept else None
     led = _by_torque(task, starts, train, only)
     if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
-        # Where torques do not lead the way the first half second tells good starts from bad.
-        heat = (
-            (settings.SCREENING.heat, None)
-            if torque_error.tells_all(starts[0][0])
-            else (settings.SCREENING.iterations, HORIZONS[0])
-        )
-        heats = _short_fits(task, led, train, only, *heat)
+        heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
         ahead = heats[: settings.SCREENING.followed]
         if ahead[0][0].normalised_error > settings.SCREENING.hopeless * task.reach:
             return [(found, model.with_values(_numbers(found))) for found, model in ahead]
@@ -588,7 +582,6 @@ def _short_fits(
     train: Sequence[DataSet],
     only: Sequence[str] | None,
     iterations: int,
-    horizon: float | None = None,
 ) -> list[tuple[Fit, Model]]:
     """Fits to an excerpt, with the models they set out from, best first.
 
@@ -598,7 +591,6 @@ def _short_fits(
         train: Prepared records.
         only: As of `identify.fit`.
         iterations: Of each fit.
-        horizon: s of each record; by default those of the base's own look.
 
     Raises:
         IdentificationError: none of them can be simulated.
@@ -606,9 +598,7 @@ def _short_fits(
     found = []
     for (model, start), at in starts:
         try:
-            screened = _screened(
-                task, model, train, only, start, at=at, iterations=iterations, horizon=horizon
-            )
+            screened = _screened(task, model, train, only, start, at=at, iterations=iterations)
             found.append((screened, model))
         except IdentificationError as error:
             failure = error
@@ -631,8 +621,8 @@ def _by_torque(
 ) -> list[Led]:
     """Those of the starts that are worth a simulation, and what the torques say of each.
 
-    Starts from which torque fits come to one minimum are one; of an effect with states, of a
-    sensor or of time the torques know too little to tell its starts apart.
+    Starts from which torque fits come to one minimum are one; of a sensor, of time, or of states
+    that something else moves than a joint, the torques know too little to tell starts apart.
     """
     models = [model for model, _ in starts]
     led: list[Led] = [(start, None) for start in starts]
@@ -642,16 +632,20 @@ def _by_torque(
     # From where the base stands it is not far.
     known = task.first or task.base
     at = {u.name: v for u, v in zip(known.unknowns, known.values, strict=True)} if known else {}
-    found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at)
+    tried = effect_of(task)
+    # Along a motion a simulation goes with each step.
+    followed = 2 * settings.SCREENING.followed if tried and tried.states else None
+    found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
     if not found:
         return led
     led = [(start, fitted.values) for start, fitted in zip(starts, found, strict=True)]
-    kind = LIBRARY[task.effect[0]] if task.effect else None
-    if kind is None or kind.states or kind.place in ('sensor', 'timing'):
+    if tried is None or tried.place in ('sensor', 'timing'):
+        return led
+    if tried.states and not along_motion.follows(tried):
         return led
     own = f'{_label(task)}.'
     told: list[int] = []
-    for k in sorted(range(len(found)), key=lambda k: found[k].cost):
+    for k in sorted(range(len(found)), key=lambda k: found[k].deviance):
         numbers = [v for n, v in found[k].values.items() if n.startswith(own)]
         others = ([v for n, v in found[i].values.items() if n.startswith(own)] for i in told)
         if not any(np.allclose(numbers, o, rtol=settings.SCREENING.alike) for o in others):

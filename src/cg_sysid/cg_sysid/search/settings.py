@@ -17,8 +17,7 @@ class Screening:
         enough_s: Length of short records that is enough, all together, in s.
         fewest_records: Short records from each set-up, at least.
         iterations: Of a first look.
-        heat: Of these, those that all starts of a candidate are given, where no rotor moves by
-            itself: there all, to the first half second.
+        heat: Of these, those that all starts of a candidate are given.
         hopeless: Times the error that matters, beyond which a candidate is given no more of them.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.

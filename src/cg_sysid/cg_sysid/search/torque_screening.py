@@ -132,14 +132,14 @@ def scores(
     plain = torque_error.without_states(model)
     declared = plain.declarations
     unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
-    fitted = torque_error.fit_by_torque(model, train, None, bounds)
+    fitted = torque_error.fit_by_torque(plain, train, None, bounds)
     problems = torque_error.problems_of(plain, train, unknowns)
     if fitted is None or not problems:
         return None
     # While its scale followed what it left, it stopped short of the minimum at its last one; and
     # whatever is put on top of it would seem to gain the rest.
     settled = torque_error.fit_by_torque(
-        model, train, None, bounds, scale=fitted.scale, at=fitted.values
+        plain, train, None, bounds, scale=fitted.scale, at=fitted.values
     )
     fitted = settled or fitted
     theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
