@@ -5,8 +5,9 @@ import pytest
 from finger import data, finger
 from scipy.integrate import solve_ivp
 
+from cg_dynamics.effects.backlash import Backlash
 from cg_sysid.identification import along_motion
-from cg_sysid.identification.along_motion import LONGEST_STEP, follows
+from cg_sysid.identification.along_motion import follows
 from cg_sysid.identification.torque_error import fits_by_torque, problems_of
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search.candidates import starts_of
@@ -113,12 +114,12 @@ def test_without_a_compiler_it_is_the_same(stiff, monkeypatch):
 
 
 def test_a_rotor_that_runs_away_is_no_start(stiff):
-    """Steps of 0.5 ms follow a rotor of 5600 rad/s or less."""
+    """Steps of play, 0.5 ms, follow a rotor of 5600 rad/s or less."""
     model = finger()
     starts = [
         DRIVES['backlash'], {**DRIVES['backlash'], 'rotor_inertia': 1e-8, 'stiffness': 50.0}
     ]  # fmt: skip
-    assert np.sqrt(50.0 / 1e-8) * LONGEST_STEP > 2.8
+    assert np.sqrt(50.0 / 1e-8) * Backlash.largest_step > 2.8
     good, bad = fits_by_torque([model.with_effect('backlash', **s) for s in starts], stiff)
     assert np.isfinite(good.deviance)
     assert bad.deviance == np.inf

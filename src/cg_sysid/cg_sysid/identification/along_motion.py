@@ -23,7 +23,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiler import compiler, shared_library
 
 HOOKS = 'deliver', 'transmit', 'joint_torque'  # in the order in which they act
-LONGEST_STEP = 5e-4  # s
+LONGEST_STEP = 1e-3  # s
 AT_ONCE = 250  # intervals that are simulated in one call
 
 
