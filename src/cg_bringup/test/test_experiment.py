@@ -99,7 +99,8 @@ def test_a_node_that_fails_is_reported_with_its_words(tmp_path):
     with pytest.raises(ExperimentError, match='initial_state needs 2 numbers'):
         run_experiment(wrong)
     with pytest.raises(ValueError, match=r"no model '.*model\.yaml': there is no file"):
-        run_experiment(Run(experiment, tmp_path / 'bag', model_file=model))
+        # Another bag: of the one before there may be what was recorded until then.
+        run_experiment(Run(experiment, tmp_path / 'another_bag', model_file=model))
 
 
 def test_recordings_are_never_overwritten(tmp_path, capsys):
