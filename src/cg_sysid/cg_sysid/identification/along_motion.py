@@ -86,6 +86,7 @@ class AlongMotion:
         angle, rate, torque = (ca.SX.sym(n) for n in ('angle', 'rate', 'torque'))
         before = _before(model, effect, torque, angle, rate, by_name)
         self._motor = ca.Function('motor', [torque, angle, rate, p], [before])
+        self._told = np.array(ca.which_depends(before, p, 1, False), bool)
         own = ca.SX.sym('own', len(self.names))
         start = ca.vertcat(*effect.initial_states(angle, rate, torque, _named(effect, own)))
         self._start = ca.Function(
@@ -106,8 +107,8 @@ class AlongMotion:
         Returns:
             N m (N), shapes (k,) and (k, len(own)).
         """
-        asked = np.concatenate([p, own]).tobytes()
-        if asked == self._last[0]:  # a derivative where a step has just been tried
+        asked = np.concatenate([p[self._told], own]).tobytes()
+        if asked == self._last[0]:  # a derivative where a step has been tried, or others moved
             return self._last[1]
         forces, slopes = [], []
         for samples in self._records:

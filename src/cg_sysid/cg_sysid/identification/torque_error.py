@@ -423,7 +423,8 @@ class Problem:
         found = self.error(vector[:plain])[:, :, 0]
         for effect, own in self._followed(vector):
             force, _ = effect(vector[:plain], vector[own])
-            found = found + force[:, None] * effect.direction
+            with np.errstate(invalid='ignore'):  # of one that ran away
+                found = found + force[:, None] * effect.direction
         return found
 
     def derivative(self, vector: np.ndarray) -> np.ndarray:

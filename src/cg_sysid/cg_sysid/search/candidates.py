@@ -633,12 +633,20 @@ def _by_torque(
     known = task.first or task.base
     at = {u.name: v for u, v in zip(known.unknowns, known.values, strict=True)} if known else {}
     tried = effect_of(task)
-    # Along a motion a simulation goes with each step.
+    # Along a motion a simulation goes with each step. Those of the base are made once: their
+    # numbers stay.
     followed = 2 * settings.SCREENING.followed if tried and tried.states else None
+    settled = tuple(
+        f'{e.label}.' for e in task.model.effects
+        if along_motion.follows(e) and (tried is None or e.label != tried.label)
+    )  # fmt: skip
+    if settled:
+        unknowns = unknowns_of(models[0], only, task.bounds)
+        only = [u.name for u in unknowns if not u.name.startswith(settled)]
     found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
     if not found:
         return led
-    led = [(start, fitted.values) for start, fitted in zip(starts, found, strict=True)]
+    led = [(start, at | fitted.values) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led
     if tried.states and not along_motion.follows(tried):
