@@ -570,7 +570,7 @@ def seen_by_torques(model: Model) -> frozenset[str]:
     """Full names of the parameters that (TE) may depend on."""
     plain, followed = apart(model)
     own = {f'{effect.label}.{q.name}' for effect in followed for q in effect.parameters}
-    return own | frozenset(plain.declarations)
+    return frozenset(own).union(plain.declarations)
 
 
 def without_states(model: Model) -> Model:

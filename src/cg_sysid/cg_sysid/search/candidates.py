@@ -646,7 +646,7 @@ def _by_torque(
     found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
     if not found:
         return led
-    led = [(start, at | fitted.values) for start, fitted in zip(starts, found, strict=True)]
+    led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led
     if tried.states and not along_motion.follows(tried):
