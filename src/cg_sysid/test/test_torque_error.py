@@ -308,8 +308,8 @@ def test_a_fit_with_play_sets_out_from_torques():
     for start in starts_of(Backlash(believed.mechanism))[::2]:
         model = believed.with_effect('backlash', **start)
         errors.append(fit(model, data_sets).normalised_error)
-    # Noise alone gives 1. By simulation alone the best start comes to 5.2, and half of them stay
-    # above 50.
+    # Noise alone gives 1. By simulation alone the best of nine starts comes to 5.2, and half of
+    # them stay above 50.
     assert min(errors) < 1.1
     assert np.median(errors) < 10
 

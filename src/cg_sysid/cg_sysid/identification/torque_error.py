@@ -234,9 +234,9 @@ def fits_by_torque(
     Those that differ in nothing that the torques see, as in a delay, are fitted once. Of more than
     `followed` fits the best go on to their minimum, after the first few iterations of all.
     """
+    names = seen_by_torques(models[0])
     unknowns = [
-        tuple(u for u in unknowns_of(model, only, bounds) if u.name in seen_by_torques(model))
-        for model in models
+        tuple(u for u in unknowns_of(model, only, bounds) if u.name in names) for model in models
     ]
     problems = problems_of(models[0], data_sets, unknowns[0])
     if not problems:
