@@ -67,6 +67,7 @@ def run_experiment(run: Run, on_wait: Callable[[], None] = lambda: None) -> Reco
             _carry_out(run, _relaying(log, on_wait), log)
             counts = check_counts(run)
         except ExperimentError as error:
+            _forget_empty(run.bag)
             log.seek(0)
             said = log.read().strip()
             raise ExperimentError(f'{run.experiment.name}: {error}\n{said}') from None
@@ -86,8 +87,6 @@ def _carry_out(run: Run, on_wait: Callable[[], None], log: IO) -> None:
     except (ProcessDied, TimeoutError) as error:
         raise ExperimentError(str(error)) from None
     if status != 0:
-        if run.mode == WIRED:
-            _forget_unannounced(run.bag)
         raise ExperimentError(f'{machine} gave up with status {status}')
     for name, status in statuses.items():
         if status != 0:
@@ -112,11 +111,22 @@ def _relaying(log: IO, on_wait: Callable[[], None]) -> Callable[[], None]:
     return relay
 
 
-def _forget_unannounced(bag: Path) -> None:
-    """Remove a bag that ended before its experiment was announced: there is none in it."""
+def _forget_empty(bag: Path) -> None:
+    """Remove a bag with no experiment in it, or with nothing else: nothing was recorded."""
     metadata = bag / 'metadata.yaml'
-    if metadata.is_file() and topics.EXPERIMENT not in read_text(metadata):
-        shutil.rmtree(bag)
+    if metadata.is_file():
+        heard = {topic for topic, count in _counts_in(metadata).items() if count > 0}
+        if topics.EXPERIMENT not in heard or heard == {topics.EXPERIMENT}:
+            shutil.rmtree(bag)
+
+
+def _counts_in(metadata: Path) -> dict[str, int]:
+    """Messages per topic, as the metadata of a bag have them."""
+    tree = parse_yaml(read_text(metadata), str(metadata))['rosbag2_bagfile_information']
+    return {
+        topic['topic_metadata']['name']: topic['message_count']
+        for topic in tree['topics_with_message_count']
+    }
 
 
 def _size(bag: Path) -> int:
@@ -137,11 +147,7 @@ def check_counts(run: Run) -> dict[str, int]:
     metadata = run.bag / 'metadata.yaml'
     if not metadata.is_file():
         raise ExperimentError(f'{run.bag} was not closed; `recover` makes a bag of it')
-    tree = parse_yaml(read_text(metadata), str(metadata))['rosbag2_bagfile_information']
-    counts = {
-        topic['topic_metadata']['name']: topic['message_count']
-        for topic in tree['topics_with_message_count']
-    }
+    counts = _counts_in(metadata)
     expected = round(run.length * RATE_HZ)
     if run.mode == WIRED:
         rate = read_raw(run.bag).note.get('nominal_rate_hz', RATE_HZ)

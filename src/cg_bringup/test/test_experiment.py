@@ -98,9 +98,9 @@ def test_a_node_that_fails_is_reported_with_its_words(tmp_path):
     )
     with pytest.raises(ExperimentError, match='initial_state needs 2 numbers'):
         run_experiment(wrong)
+    assert not wrong.bag.exists()
     with pytest.raises(ValueError, match=r"no model '.*model\.yaml': there is no file"):
-        # Another bag: of the one before there may be what was recorded until then.
-        run_experiment(Run(experiment, tmp_path / 'another_bag', model_file=model))
+        run_experiment(Run(experiment, wrong.bag, model_file=model))
 
 
 def test_recordings_are_never_overwritten(tmp_path, capsys):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from robot_in_memory import RobotInMemory
 
 from cg_bringup import experiment, operating
@@ -191,12 +192,25 @@ def test_the_person_hears_the_operator_and_not_the_log(tmp_path, capsys):
     assert capsys.readouterr().out == 'let go of the legs now\nhalf a line\n'
 
 
-def test_a_bag_of_no_experiment_is_not_kept(tmp_path):
-    for name, topic in (('kept', topics.EXPERIMENT), ('empty', topics.IMU)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / 'metadata.yaml').write_text(f'topic: {topic}\n', encoding='utf-8')
-        experiment._forget_unannounced(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == ['kept']
+@pytest.mark.parametrize(
+    ('heard', 'kept'),
+    [
+        ((topics.EXPERIMENT, topics.IMU), True),
+        ((topics.IMU,), False),
+        ((topics.EXPERIMENT,), False),
+    ],
+)
+def test_a_bag_without_an_experiment_or_a_sample_is_not_kept(tmp_path, heard, kept):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    counts = [
+        {'topic_metadata': {'name': name}, 'message_count': int(name in heard)}
+        for name in (topics.EXPERIMENT, topics.IMU)
+    ]
+    tree = {'rosbag2_bagfile_information': {'topics_with_message_count': counts}}
+    (bag / 'metadata.yaml').write_text(yaml.safe_dump(tree), encoding='utf-8')
+    experiment._forget_empty(bag)
+    assert bag.exists() == kept
 
 
 def test_nobody_answers_for_the_pose(monkeypatch, tmp_path):

@@ -7,6 +7,7 @@ in    the sensor and torque topics of `mechanism`, /experiment, and those of `al
 out   /recorder/progress
 """
 
+import contextlib
 import functools
 import importlib
 import os
@@ -185,6 +186,10 @@ class RecorderNode(Node):
 
     def close(self) -> None:
         """Make the recording an ordinary bag."""
+        # Somebody may have given the robot's nodes real-time priority, where niceness counts for
+        # nothing: then this would keep a processor from the loop that still balances.
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             result = self.recording.close()
         except (ValueError, OSError) as error:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from rosbags.highlevel import AnyReader
@@ -15,11 +16,13 @@ rclpy = pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import WrenchStamped  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from cg_interfaces.domains import own_domain  # noqa: E402
 from cg_interfaces.ros import LATCHED_QOS, MACHINE_QOS, to_stamp  # noqa: E402
+from cg_sysid.recorder_node import RecorderNode  # noqa: E402
 from cg_sysid.records.recover import JOURNAL_NAME, needs_recovery, recover  # noqa: E402
 
 pytestmark = pytest.mark.alone
@@ -207,6 +210,28 @@ def test_a_full_disk_ends_the_recording_with_one_error_and_keeps_what_came_befor
     assert set(stored) == set(TOPICS)
     for stamps in stored.values():
         assert set(stamps) <= set(sender.sent)
+
+
+def test_a_recorder_that_ends_leaves_the_processors_to_the_loop(tmp_path):
+    # In a thread of its own, as policies are those of threads.
+    def end_at_real_time_priority():
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        recorder.close()
+        return os.sched_getscheduler(0)
+
+    with own_domain():
+        rclpy.init()
+        bag = Parameter('bag', value=str(tmp_path / 'bag'))
+        recorder = RecorderNode(parameter_overrides=[bag])
+        try:
+            with ThreadPoolExecutor(1) as thread:
+                policy = thread.submit(end_at_real_time_priority).result()
+        except PermissionError:
+            pytest.skip('this user may give no real-time priority')
+        finally:
+            recorder.destroy_node()
+            rclpy.try_shutdown()
+    assert policy == os.SCHED_OTHER
 
 
 @pytest.mark.parametrize(
