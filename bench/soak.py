@@ -3,6 +3,8 @@
     ./cg exec python bench/soak.py [--lockstep-minutes 60] [--wires-minutes 15] [--first] [--write]
     ./cg exec python bench/soak.py --minutes 1        both, shorter; 0 leaves one out
 
+Each has its own page, bench/results/soak_lockstep.md and soak_wires.md.
+
 Lock-step: simulation node, observer, controller, gate and recorder go as fast as they can, 500
 samples in each simulated second. On wires: the same above emulated devices, in real time. A push
 comes every 30 s.
@@ -54,7 +56,7 @@ from cg_description.model_file import write_atomically
 from cg_interfaces import topics
 from cg_interfaces.domains import own_domain
 
-TABLE = ROOT / 'bench/results/soak.md'
+RESULTS = ROOT / 'bench/results'
 LOG = ROOT / 'build/soak.log'
 RATE, PERIOD_NS = 500, 2_000_000
 PUSHED, PUSH = 30.0, 0.2  # s from one push to the next, N s
@@ -320,6 +322,17 @@ def slope(rows: np.ndarray) -> float:
     return float(3600 * np.polyfit(second[:, 0], second[:, 1], 1)[0])
 
 
+def page(run: Run, words: str) -> str:
+    """Of one run, and of the words of the command that repeats it."""
+    return '\n'.join([
+        '# A robot that stands for long', '',
+        f'Command: `./cg exec python bench/soak.py {words} --write`. '
+        f'{os.cpu_count()} cores. Memory is resident, start is after {100 * WARM:.0f} % of the '
+        f'run; it grows where the end has {GROWTH:g} MB more than the middle.',
+        *tables(run), '',
+    ])  # fmt: skip
+
+
 def tables(run: Run) -> Iterator[str]:
     """Of one run."""
     pace = f' in {run.took / 60:.1f} min' if run.name == 'lock-step' else ''
@@ -391,17 +404,12 @@ def main() -> int:
             with tempfile.TemporaryDirectory(prefix='cg_soak_') as folder:
                 runs.append(makers[name](60 * length, Path(folder)))
             print(file=sys.stderr)
-    words = ' '.join(f'--{name}-minutes {length:g}' for name, length in minutes.items())
-    text = '\n'.join([
-        '# A robot that stands for long', '',
-        f'Command: `./cg exec python bench/soak.py {words}{" --first" * options.first} --write`. '
-        f'{os.cpu_count()} cores. Memory is resident, start is after {100 * WARM:.0f} % of the '
-        f'run; it grows where the end has {GROWTH:g} MB more than the middle.',
-        *(line for run in runs for line in tables(run)), '',
-    ])  # fmt: skip
-    print(text)
-    if options.write:
-        write_atomically(TABLE, text)
+            alone = dict.fromkeys(minutes, 0.0) | {name: length}
+            words = ' '.join(f'--{n}-minutes {m:g}' for n, m in alone.items())
+            text = page(runs[-1], words + ' --first' * (options.first and name == 'wires'))
+            print(text)
+            if options.write:
+                write_atomically(RESULTS / f'soak_{name}.md', text)
     return 0 if all(map(is_right, runs)) else 1
 
 

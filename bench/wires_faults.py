@@ -204,6 +204,8 @@ def version_of_sources(first: bool, rate: float) -> str:
     """A hash of all sources that a trial depends on, and how the robot is run."""
     files = [
         *(f for p in SOURCES for f in ROOT.glob(f'src/cg_{p}/cg_{p}/**/*.py')),
+        *ROOT.glob('src/cg_sysid/cg_sysid/records/*.py'),
+        ROOT / 'src/cg_sysid/cg_sysid/recorder_node.py',
         *ROOT.glob('src/cg_description/models/*.yaml'),
         *(ROOT / f'bench/wires_{name}.py' for name in ('rig', 'classes', 'rivals', 'faults')),
     ]
