@@ -258,6 +258,28 @@ def test_stiff_joint_moves_like_a_rotor_bolted_on(bare):
     np.testing.assert_allclose(flexible[:, :2], np.array(rigid)[:, :2], atol=2e-4)
 
 
+@pytest.mark.parametrize('rounding', [0.005, 2.5e-4])
+def test_teeth_that_begin_sharply_touch_where_the_gap_ends(rounding):
+    # Between teeth without any rounding, torque is k times what is beyond the gap, and d times the
+    # relative rate only there. A ramp rounded over r is off by r/2 at its corner. At a distance x
+    # from it, it is off by r^2/4x, and its slope by r^2/4x^2, to first order.
+    effect = make_effect('backlash', COMPASS)
+    half, k, d = 0.009, 7300.0, 18.0
+    beyond, r = 4e-4, rounding * half
+    p = {'gap': 2 * half, 'rotor_inertia': 0.12, 'stiffness': k, 'damping': d}
+    wind_up = np.array([-half - beyond, -half, -0.4 * half, 0.7 * half, half + beyond])
+    told = [
+        float(effect.transmit(0.0, 0.1, 0.3, [0.1 + e, 0.5], p | {'rounding': rounding})[0])
+        for e in wind_up
+    ]
+    inside = np.clip(wind_up, -half, half)
+    sharp = k * (wind_up - inside) + d * (0.5 - 0.3) * (np.abs(wind_up) > half)
+    away = [0, 2, 3, 4]
+    off = 1.1 * (k * r**2 / (4 * beyond) + d * 0.2 * r**2 / (4 * beyond**2))
+    assert told[1] == pytest.approx(d * 0.2 / 2 - k * r / 2, rel=1e-3)
+    assert np.array(told)[away] == pytest.approx(sharp[away], abs=off)
+
+
 def test_backlash_lets_the_joint_go_inside_the_gap(bare):
     """In the middle of the gap no torque passes; at its edge the tooth presses."""
     model = bare.with_effect('backlash', gap=0.02, rotor_inertia=0.1)

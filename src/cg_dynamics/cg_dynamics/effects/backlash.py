@@ -1,5 +1,7 @@
 """Play between motor and joint."""
 
+from math import log
+
 import casadi as ca
 
 from cg_dynamics.effects.effect import Effect
@@ -9,10 +11,13 @@ from cg_dynamics.parameter import Parameter
 class Backlash(Effect):
     """A rotor of reflected inertia drives the joint through a gap.
 
-    With e = a - angle the wind-up, g half of the gap and s(x) = (x + sqrt(x^2 + w^2))/2 a ramp
-    smoothed over w = g/200, the teeth touch by
+    With e = a - angle the wind-up, g half of the gap and s(x) = (x + sqrt(x^2 + r^2))/2 a ramp
+    rounded over r = `rounding` g, the teeth touch by
 
     x = s(e - g) - s(-e - g),  tau_joint = k x + d c (w - rate),  c = dx/de         (GAP)
+
+    Teeth that give way by less than r are told as soft. The narrower the rounding, the more a fit
+    is held up by single impacts: so it gets narrow only where gap and teeth are known already.
     """
 
     name = 'backlash'
@@ -39,6 +44,11 @@ class Backlash(Effect):
             'damping', 'N m s/rad', 'of the touching teeth', 1e-3, 1000.0,
             starts=(5.0,), scale=0.5, logarithmic=True,
         ),
+        Parameter(
+            'rounding', '1', 'share of half of the gap where teeth begin to touch', 1e-4, 0.05,
+            starts=(0.005,), scale=5e-4, free=False, logarithmic=True,
+            leeway=log(20.0),
+        ),
     )  # fmt: skip
     states = ('rotor_angle', 'rotor_rate')
     largest_step = 0.0005
@@ -48,13 +58,13 @@ class Backlash(Effect):
         a, w = z
         half = p['gap'] / 2
         wind_up = a - angle
-        width = half / 200
+        rounded = p['rounding'] * half
 
         def ramp(x):
-            return (x + ca.sqrt(x**2 + width**2)) / 2
+            return (x + ca.sqrt(x**2 + rounded**2)) / 2
 
         def step(x):
-            return (1 + x / ca.sqrt(x**2 + width**2)) / 2
+            return (1 + x / ca.sqrt(x**2 + rounded**2)) / 2
 
         pressed = ramp(wind_up - half) - ramp(-wind_up - half)
         touching = step(wind_up - half) + step(-wind_up - half)
