@@ -18,6 +18,8 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
+from cg_description.reading import shown
+
 WIDTH, INDENT = 99, ' ' * 6  # of the table
 
 
@@ -109,7 +111,7 @@ def check_setting(field: dataclasses.Field, value: Any) -> None:
     """Raise a ValueError that names the setting, its value and what is allowed."""
     choices = field.metadata['choices']
     if choices and value not in choices:
-        raise ValueError(f'{field.name} is {value!r}; allowed are {", ".join(choices)}')
+        raise ValueError(f'{field.name} is {shown(value)}; allowed are {", ".join(choices)}')
     minimum, maximum = field.metadata['minimum'], field.metadata['maximum']
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, bool) or not isinstance(number, int | float):

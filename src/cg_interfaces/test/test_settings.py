@@ -25,6 +25,7 @@ def test_defaults_are_valid():
         ({'rate': 0.5}, r'rate is 0\.5; allowed is 1\.0 to 2000\.0 Hz'),
         ({'rate': float('nan')}, 'rate is nan'),
         ({'mode': 'c'}, "mode is 'c'; allowed are a, b"),
+        ({'mode': 1000 * 'c'}, "mode is 'c{1,99}…'; allowed are a, b"),
         ({'weights': [1.0, -2.0]}, r'weights is -2\.0; allowed is 0\.0 or more'),
     ],
 )

@@ -268,6 +268,18 @@ def test_what_is_no_bag_is_refused(tmp_path, kind):
         bags.read_bag(path)
 
 
+@pytest.mark.parametrize('word', ['/applied_torque', 'sensor_msgs/msg/JointState'])
+def test_a_topic_that_is_called_by_a_number_is_refused(tmp_path, word):
+    # A text of YAML 1.1, as we read it, and a number of YAML 1.2, as the reader of bags does.
+    path = bags.write_bag(tmp_path / 'bag', compass_record())
+    file = path / 'metadata.yaml'
+    file.write_text(file.read_text().replace(word, '1e+308'))
+    with pytest.raises(
+        RecordingError, match=r'calls a topic or its type 1e\+308; expected a text'
+    ):
+        bags.read_bag(path)
+
+
 @pytest.mark.parametrize('share', [0.3, 0.9, 0.999])
 def test_a_truncated_bag_names_the_way_out(tmp_path, share):
     path = bags.write_bag(tmp_path / 'bag', compass_record())

@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from cg_description.reading import parse_yaml, path_of, read_text
+from cg_description.reading import parse_yaml, path_of, read_text, shown
 from cg_description.schema import Mapping as Form
 from cg_interfaces import channels
 from cg_interfaces.channels import STRING, TRAJECTORY_STATE, Topic
@@ -109,6 +109,10 @@ def _read_open(
     """The body of `read_raw`, on an open reader."""
     if reader.message_count == 0:
         raise RecordingError(f'{path}: empty; the bag holds no message')
+    for name in (name for c in reader.connections for name in (c.topic, c.msgtype)):
+        if not isinstance(name, str):
+            msg = f'{path}: metadata.yaml calls a topic or its type {shown(name)}; expected a text'
+            raise RecordingError(msg)
     merged_note = {**_read_note(path, reader), **(note or {})}
     mechanism = _mechanism_of(path, merged_note, of_model)
     topics = _topics_in(path, {c.topic: c.msgtype for c in reader.connections}, merged_note,
