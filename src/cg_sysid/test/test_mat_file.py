@@ -99,6 +99,15 @@ def deep(levels):
     return written({'a': tree}, long_field_names=True)
 
 
+def half_a_width():
+    """A struct whose length of field names is 0.5, and no integer."""
+    data = written({'a': {'t': TIME}})
+    width = np.array([5, 4], '<i2').tobytes()  # a small element of 4 bytes: an int32
+    at = data.index(width)
+    half = np.array([7, 4], '<i2').tobytes() + np.array(0.5, '<f4').tobytes()
+    return data[:at] + half + data[at + 8 :]
+
+
 @pytest.mark.parametrize(
     ('data', 'said'),
     [
@@ -109,9 +118,10 @@ def deep(levels):
         (written({'t': TIME}, do_compression=True)[:-9], 'longer than the file'),
         (written({'t': TIME})[:124] + b'\0\x02IM' + b'\0' * 50, r'version 7\.3; save it again'),
         (deep(60), 'nested more than'),
+        (half_a_width(), 'a number with a fraction'),
         (written({'t': np.zeros(60_000_000)}, do_compression=True), 'unpacks to more than'),
     ],
-    ids=range(8),
+    ids=range(9),
 )  # fmt: skip
 def test_what_is_damaged_or_too_large_is_refused(data, said):
     with pytest.raises(MatError, match=said):

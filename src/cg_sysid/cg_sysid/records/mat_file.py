@@ -122,6 +122,13 @@ class _Reader:
             raise MatError('damaged: an element holds a part of a number')
         return np.frombuffer(content, form)
 
+    def integers(self, element: tuple[int, bytes]) -> np.ndarray:
+        """Sizes, flags and characters, which have no fractions."""
+        found = self.numbers(element)
+        if found.dtype.kind == 'f':
+            raise MatError('damaged: a size, a flag or a name is a number with a fraction')
+        return found
+
     def array(
         self, content: bytes, called: str | None, depth: int
     ) -> Iterator[tuple[str, np.ndarray]]:
@@ -131,7 +138,7 @@ class _Reader:
         if depth > DEEPEST:
             raise MatError(f'structs are nested more than {DEEPEST} deep')
         parts = self.elements(content)
-        flags, dimensions, named = (self.numbers(self.next_of(parts)) for _ in range(3))
+        flags, dimensions, named = (self.integers(self.next_of(parts)) for _ in range(3))
         if not len(flags) or len(dimensions) < 2 or (dimensions < 0).any():
             raise MatError('damaged: an array without class or dimensions')
         name = named.astype(np.uint8).tobytes().decode('latin-1') if called is None else called
@@ -147,7 +154,7 @@ class _Reader:
     def fields(
         self, name: str, parts: Iterator[tuple[int, bytes]], depth: int
     ) -> Iterator[tuple[str, np.ndarray]]:
-        width = self.numbers(self.next_of(parts))
+        width = self.integers(self.next_of(parts))
         _, names = self.next_of(parts)
         if len(width) != 1 or not 0 < width[0] <= 1024 or len(names) % width[0]:
             raise MatError('damaged: a struct whose fields have no names')
