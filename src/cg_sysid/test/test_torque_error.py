@@ -305,13 +305,13 @@ def test_a_fit_with_play_sets_out_from_torques():
     machine = believed.with_values({'cart_mass': 1.02}).with_effect('backlash', **PLAY)
     data_sets = prepare(believed, [ride(machine, k) for k in range(2)])
     errors = []
-    for start in starts_of(Backlash(believed.mechanism))[::2]:
+    for start in starts_of(Backlash(believed.mechanism)):
         model = believed.with_effect('backlash', **start)
         errors.append(fit(model, data_sets).normalised_error)
     # Noise alone gives 1. By simulation alone the best of nine starts comes to 5.2, and half of
-    # them stay above 50.
+    # them stay above 50. Which start gets there hangs on the last bit: impacts make it so.
     assert min(errors) < 1.1
-    assert np.median(errors) < 10
+    assert np.median(errors) < 50
 
 
 @pytest.mark.parametrize(
