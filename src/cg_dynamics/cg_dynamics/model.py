@@ -223,6 +223,14 @@ class Model:
             f'{", ".join(e.label for e in self.effects) or "none"}'
         )
 
+    def dry_friction(self, joint: str) -> float:
+        """Level of all dry friction at a joint together, N m (N where it slides)."""
+        return sum(
+            abs(self.values[f'{e.label}.{e.parameters[0].name}'])
+            for e in self.effects
+            if e.friction == 'dry' and e.site == joint and e.parameters[0].unit in ('N m', 'N')
+        )
+
     def values_of(self, effect: Effect) -> dict[str, float]:
         """The values of one effect's own parameters, by their names within it."""
         return {

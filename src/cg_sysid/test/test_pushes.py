@@ -5,10 +5,12 @@ and middle are what all of them have in common.
 """
 
 import math
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
+from hanging_arm import nominal as arm
 from unlisted import SETUPS, hide
 
 from cg_dynamics.effects.effect import TIME, StanceEffect
@@ -17,6 +19,7 @@ from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.search import model_selection
 
 SAMPLE = 0.002
 DURATION = 4.0
@@ -123,3 +126,39 @@ def test_a_push_in_a_record_held_out_and_in_no_other(model_file):
     assert name == 'record_3'
     value, sigma, _ = event['impulse']
     assert value == pytest.approx(impulse, abs=max(3 * sigma, 0.01 * impulse))
+
+
+@pytest.mark.parametrize(('thigh', 'shank', 'told'), [
+    # Dry friction of the arm: 0.15 N m at the thigh, 0.1 at the shank. A pulse of 0.1 s is
+    # 0.346 s long; at 2 % of the friction it has 1.04 and 0.69 mN m s.
+    (0.9e-3, 0.5e-3, '2 % of the dry friction at thigh_joint'),
+    (0.6e-3, -0.6e-3, '2 % of the dry friction at shank_joint'),
+    (1.2e-3, 0.5e-3, ''),
+    (0.5e-3, -0.8e-3, ''),
+    # What is not sure says nothing: its standard deviation is 0.1 mN m s.
+    (0.9e-3, 0.4e-3, '2 % of the dry friction at thigh_joint'),
+])  # fmt: skip
+def test_what_friction_may_be_off_is_no_push(monkeypatch, thigh, shank, told):
+    model = arm().with_effect('external_push', 'shank', duration=0.1)
+    o = SimpleNamespace(label='external_push@shank', model=model)
+    event = {
+        'impulse_shank_joint': (shank, 1e-4, 'N m s'),
+        'impulse_thigh_joint': (thigh, 1e-4, 'N m s'),
+        'impulse_hip_joint': (3e-4, 1e-4, 'N m s'),
+        'instant': (2.0, 0.01, 's'),
+    }
+    monkeypatch.setattr(model_selection, 'events_of', lambda o, label: {'way': event})
+    reason = ' '.join(model_selection.within_friction(o))
+    assert reason.startswith(told)
+    assert bool(reason) == bool(told)
+    # A joint without dry friction has nothing that could be off.
+    o.model = model.without_effect('coulomb_friction@thigh_joint')
+    assert not model_selection.within_friction(o)
+
+
+def test_a_push_of_a_compass_gait_is_not_compared_with_friction(model_file, monkeypatch):
+    model = Model.load(model_file).with_effect('external_push', impulse=1e-6)
+    o = SimpleNamespace(label='external_push', model=model)
+    event = {'impulse': (1e-6, 1e-9, 'N s'), 'instant': (1.0, 0.01, 's')}
+    monkeypatch.setattr(model_selection, 'events_of', lambda o, label: {'swing': event})
+    assert not model_selection.within_friction(o)

@@ -332,3 +332,21 @@ def test_what_a_light_drive_hides_is_found_from_starts_of_its_size(name, hidden)
     values = found.model.values
     size = 'stiffness' if name == 'joint_flexibility' else 'gap'
     assert values[f'{name}.{size}'] == pytest.approx(hidden[size], rel=0.05)
+
+
+def test_a_start_whose_sensitivities_run_away_stays_where_it_is(believed, monkeypatch):
+    data_sets = data(believed.with_values(OFF), believed)
+    real, calls = torque_error.derivatives, []
+
+    def run_away(*args):
+        calls.append(args)
+        slopes = real(*args)
+        if len(calls) > 2:
+            slopes[3, 1, 0] = np.inf
+        return slopes
+
+    monkeypatch.setattr(torque_error, 'derivatives', run_away)
+    found = fit_by_torque(believed, data_sets)
+    assert len(calls) == 3
+    assert np.isfinite(found.cost)
+    assert all(np.isfinite(value) for value in found.values.values())

@@ -78,6 +78,12 @@ class ExternalPush(StanceEffect):
             *others,
         )  # fmt: skip
 
+    def torques(self, values):
+        """Torque about each joint of a robot during the pulse, on average: joint -> N m (N)."""
+        length = math.sqrt(12) * values['duration']
+        impulses = {n: v for n, v in values.items() if n.startswith('impulse_')}
+        return {n.removeprefix('impulse_'): v / length for n, v in impulses.items()}
+
     def acts(self, values):
         """Where any impulse is not 0."""
         return any(values[p.name] for p in self.parameters if p.neutral is not None)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
@@ -34,6 +35,7 @@ def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Compariso
                 base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
         comparison = less_shapes(work, work.selection.compare(base, outcomes))
+        comparison = compared_with_free_shapes(work, comparison)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
 

@@ -4,9 +4,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from cg_sysid.diagnosis.comparing import alone, compare, refitted, worth_a_look
+from cg_sysid.diagnosis.free_shapes import with_hard_friction
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
@@ -54,28 +53,6 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     found = with_hard_friction(work, found)
     # Beside a large cause they would explain a little of it; then they can wait.
     return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
-
-
-def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
-    """The same with dry friction that turns as fast as it likes, where it does so as it may.
-
-    Not from the start: the harder friction is, the rougher is the way to the minimum.
-    """
-    bounds, declared = dict(o.task.bounds), o.model.declarations
-    for u, value in zip(o.train.unknowns, o.train.values, strict=True):
-        if (
-            u.name in bounds
-            and declared[u.name].smoothing
-            and value < settings.DOUBT.hard * u.lower
-        ):
-            bounds[u.name] = float(np.log(u.prior / declared[u.name].lower))
-    if bounds == o.task.bounds:
-        return o
-    task = Task(o.model, events=o.events, bounds=bounds)
-    task = replace(task, warm_starts=(started_from(o.train, o.model, bounds),))
-    title = f'{title_of(work.added(o))}, with hard friction'
-    hard = work.halving.fit([task], title)[0]
-    return hard if isinstance(hard, Outcome) and chi2(hard) < chi2(o) else o
 
 
 def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:

@@ -301,7 +301,8 @@ def _descend(
 ) -> TorqueFit:
     """From a start to the minimum: Gauss-Newton, damped.
 
-    A start from which a rotor runs away stays where it is, at an infinite cost.
+    A start from which a rotor runs away stays where it is, at an infinite cost; so does one whose
+    sensitivities run away, at its own.
     """
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     theta = np.array([
@@ -315,12 +316,15 @@ def _descend(
     damping, patience = DAMPING, PATIENCE
     cost = _cost(residual, scale, theta, prior, tolerance)
     for _ in range(iterations if np.isfinite(cost) else 0):
-        jacobian = derivatives(problems, unknowns, theta)
         weight = 1 / beyond(residual / scale)
         r = (weight * residual / scale).ravel()
-        j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
-        h = j.T @ j + np.diag(1 / tolerance**2)
-        g = j.T @ r + (theta - prior) / tolerance**2
+        with np.errstate(over='ignore', invalid='ignore'):
+            jacobian = derivatives(problems, unknowns, theta)
+            j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
+            h = j.T @ j + np.diag(1 / tolerance**2)
+            g = j.T @ r + (theta - prior) / tolerance**2
+        if not (np.isfinite(h).all() and np.isfinite(g).all()):
+            break  # the rotor's neighbours run away
         promised = float(g @ np.linalg.lstsq(h, g, rcond=None)[0])
         better = False
         while not better and damping < MOST_DAMPING:

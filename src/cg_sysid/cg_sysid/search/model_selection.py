@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cg_dynamics.effects.external_push import ExternalPush
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
@@ -17,6 +18,7 @@ from cg_sysid.search.candidates import (
     Outcome,
     at_edge,
     chi2,
+    events_of,
     own_parameters,
     prior_conflicts,
     shared_unknowns,
@@ -180,6 +182,8 @@ class ModelSelection:
                 f'leaves {100 * left:.0f} % of the error, at most '
                 f'{100 * settings.SELECTION.mishap:.0f} % allowed'
             )
+        if eventful:
+            reasons += within_friction(o)
         own = own_parameters(o)
         # What sound robots have lies at the edge of what is a cause.
         sound = as_sound_robots(o.label, own)
@@ -285,6 +289,28 @@ def share_explained(before: Fit, after: Fit) -> float:
     """Share of the squared error above the noise that is gone, 0 to 1."""
     gone = before.normalised_error - after.normalised_error
     return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
+
+
+def within_friction(o: Outcome) -> list[str]:
+    """That a push does no more at any joint than what its dry friction may be off."""
+    push = next((e for e in o.model.effects if e.label == o.label), None)
+    if not isinstance(push, ExternalPush):
+        return []
+    shared = {p.name: o.model.values[f'{o.label}.{p.name}'] for p in push.parameters if not p.each}
+    largest, where = 0.0, ''
+    for event in events_of(o, o.label).values():
+        torques = push.torques({n: v for n, (v, _, _) in event.items()} | shared)
+        for joint, torque in torques.items():
+            value, sigma, _ = event[f'impulse_{joint}']
+            if abs(value) > settings.EVENTS.sure * sigma:
+                share = abs(torque) / (o.model.dry_friction(joint) or 1e-300)
+                if share >= largest:
+                    largest, where = share, joint
+    if not where or largest > settings.EVENTS.of_friction:
+        return []
+    return [
+        f'{100 * largest:.1g} % of the dry friction at {where}: that friction may be so far off'
+    ]
 
 
 def _known_at_all(o: Outcome) -> bool:

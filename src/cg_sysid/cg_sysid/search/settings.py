@@ -179,6 +179,8 @@ class Events:
         piece_iterations: Of such a fit.
         before_s: Before a spoilt piece: what happened may have begun there, s.
         followed: Peaks from which a fit goes on.
+        of_friction: Share of the dry friction of a joint, below which an event is an error of that
+            friction: real friction differs by more from place to place.
     """
 
     sure: float = 5.0
@@ -191,6 +193,7 @@ class Events:
     piece_iterations: int = 8
     before_s: float = 0.5
     followed: int = 3
+    of_friction: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -231,13 +231,9 @@ def _beyond_friction(
     """
     allowed = np.full(len(free), np.inf)
     for k, joint in enumerate(free):
-        sizes = [
-            abs(model.values[f'{e.label}.{e.parameters[0].name}'])
-            for e in model.effects
-            if e.friction == 'dry' and e.site == joint and e.parameters[0].unit in ('N m', 'N')
-        ]
-        if sizes:
-            allowed[k] = 2 * sum(sizes)
+        level = model.dry_friction(joint)
+        if level:
+            allowed[k] = 2 * level
     beyond = np.sign(error) * np.maximum(np.abs(error) - allowed, 0.0)
     return np.where(_turning(rates), beyond, error)
 
