@@ -484,13 +484,27 @@ def problems_of(
         places = [names.index(u.name) for u in unknowns]
         own_places = [k for k in places if k < e.p.shape[0]]
         moved = ca.vertcat(*(e.p[k] for k in own_places)) if own_places else ca.SX(0, 1)
+        balance = _balance(plain, e, setup)
         error, slope = (
-            AlongRows(e, every, ca.densify(x))
-            for x in (e.imbalance, ca.jacobian(e.imbalance, moved))
+            AlongRows(e, every, ca.densify(x)) for x in (balance, ca.jacobian(balance, moved))
         )
         vector, acted = _vector(model, setup), _acted(plain, e, every)
         found.append(Problem(e, error, slope, every, vector, places, acted, followed))
     return found
+
+
+def _balance(model: Model, e: Equations, setup: Setup) -> ca.SX:
+    """(TE), of what nothing drives as an error of its acceleration, times the inertia believed.
+
+    There all terms grow with the masses: that nothing weighs anything would leave no error.
+    """
+    own = ca.diag(e.mass_matrix)
+    believed = ca.substitute(own, e.p, parameter_vector(model, setup))
+    driven = _driving(model, setup).any(axis=0)
+    return ca.vertcat(*(
+        e.imbalance[k] if driven[k] else e.imbalance[k] * believed[k] / own[k]
+        for k in range(e.coordinates)
+    ))  # fmt: skip
 
 
 def _vector(model: Model, setup: Setup) -> np.ndarray:
@@ -502,10 +516,15 @@ def _vector(model: Model, setup: Setup) -> np.ndarray:
 
 def _acted(model: Model, e: Equations, motion: Motion) -> np.ndarray:
     """Torque that was applied on each free coordinate, shape (k, m)."""
+    driving = _driving(model, motion.setup)
+    return motion.inputs[:, : len(driving)] @ driving
+
+
+def _driving(model: Model, setup: Setup) -> np.ndarray:
+    """What one unit of each drive is on each free coordinate, shape (drives, m)."""
     body = model.mechanism
-    basis = np.asarray(body.kinematics(motion.setup).basis)
     rows = np.array([body.joints[joint] for joint in body.joints])
-    return motion.inputs[:, : len(rows)] @ rows @ basis
+    return rows @ np.asarray(body.kinematics(setup).basis)
 
 
 def residuals(
