@@ -309,9 +309,8 @@ def test_a_fit_with_play_sets_out_from_torques():
         model = believed.with_effect('backlash', **start)
         errors.append(fit(model, data_sets).normalised_error)
     # Noise alone gives 1. By simulation alone the best of nine starts comes to 5.2, and half of
-    # them stay above 50. Which start gets there hangs on the last bit: impacts make it so.
-    assert min(errors) < 1.1
-    assert np.median(errors) < 50
+    # them stay above 50.
+    assert np.median(errors) < 1.1
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.diagnosis.by_recording import what_wanders
 from cg_sysid.diagnosis.causes import as_in, named_causes, with_events
 from cg_sysid.diagnosis.doubt import without
+from cg_sysid.diagnosis.free_shapes import with_shapes_of_causes
 from cg_sysid.diagnosis.late_samples import late_samples
 from cg_sysid.diagnosis.result import Cause, Diagnosis, Verdict, gains_of
 from cg_sysid.diagnosis.small_faults import shapes, told_small_faults, with_law
@@ -49,7 +50,7 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
             unmodelled = characterise(final, work.train, work.held, work.carry_out)
     final = less_mishaps(work, nominal, final)
     causes = named_causes(work, nominal, final)
-    final = thorough(work, with_law(work, final))
+    final = with_shapes_of_causes(work, thorough(work, with_law(work, final)))
     causes = [with_events(work, final, as_in(final, cause)) for cause in causes]
     left = work.left(final)
     wandering = wandering_number(work, final) if left else None

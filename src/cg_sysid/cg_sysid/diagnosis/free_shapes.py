@@ -1,9 +1,11 @@
-"""Shapes of dry friction, let go: how it turns about rest, and how it fades.
+"""Shapes of laws, let go: how dry friction turns about rest, how teeth begin to touch.
 
 Hard friction that is simulated by a soft law leaves hundreds of times the noise. Which of several
-laws takes a little more of that says nothing: first each has to turn as the machine does.
+laws takes a little more of that says nothing: first each has to turn as the machine does. And the
+numbers of a cause lean on the shape of its law: teeth that begin to touch too early are told soft.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,7 @@ from cg_dynamics.effects.effect import Effect
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
-from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.model_selection import Comparison, above_noise
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.standings import title_of
 
@@ -33,7 +35,7 @@ def compared_with_free_shapes(work: Workspace, comparison: Comparison) -> Compar
     limit = settings.HALVING.in_reach * chi2(best)
     kin = [
         o for candidate, o in comparison.ranked
-        if not candidate.reason and chi2(o) < limit and _is_kin(o.model.effect(o.label), law)
+        if not candidate.reason and chi2(o) < limit and _dry_at(o.model.effect(o.label), law.site)
     ]  # fmt: skip
     if len(kin) < 2:
         return comparison
@@ -52,26 +54,49 @@ def compared_with_free_shapes(work: Workspace, comparison: Comparison) -> Compar
     return comparison
 
 
-def _is_kin(effect: Effect, law: Effect) -> bool:
-    return effect.friction == 'dry' and effect.site == law.site
+def _dry_at(effect: Effect, site: str) -> bool:
+    return effect.friction == 'dry' and effect.site == site
 
 
 def with_free_shapes(work: Workspace, outcomes: list[Outcome], title: str) -> list[Outcome]:
-    """Each with the shapes of the dry friction at its joint let go."""
-    tasks = []
-    for o in outcomes:
-        law = o.model.effect(o.label)
-        bounds = {
-            f'{effect.label}.{p.name}': p.leeway
-            for effect in o.model.effects if _is_kin(effect, law)
-            for p in effect.parameters if p.leeway
-        }  # fmt: skip
-        tasks.append(_again(o, bounds))
+    """Each with the shapes of its law, and of dry friction at the same joint, let go."""
+    tasks = [_again(o, _shapes_at(o, [o.label])) for o in outcomes]
     return [
         with_hard_friction(work, replace(found, label=o.label))
         for o, found in zip(outcomes, work.halving.fit(tasks, title), strict=True)
         if isinstance(found, Outcome)
     ]
+
+
+def with_shapes_of_causes(work: Workspace, o: Outcome) -> Outcome:
+    """What stands, with the shapes of its causes' laws let go where that is earned.
+
+    Near the noise small faults are not let go any more, and the shapes of laws with them.
+    """
+    bounds = _shapes_at(o, sorted(work.added(o)))
+    if o.task.bounds or not bounds or above_noise(o) < settings.NOISE.nothing_left - 1:
+        return o
+    title = f'{title_of(work.added(o))}, its laws in other shapes'
+    task = replace(
+        _again(o, bounds), thorough=True, iterations=settings.FITTING.thorough_iterations
+    )
+    found = work.halving.fit([task], title)[0]
+    if not isinstance(found, Outcome):
+        return o
+    ((judged, found),) = work.selection.compare(o, [replace(found, label=o.label)]).ranked
+    earned = judged.evidence > settings.SELECTION.earned and judged.held_gain > 0
+    return found if earned else o
+
+
+def _shapes_at(o: Outcome, labels: Sequence[str]) -> Bounds:
+    """Shapes of these laws and of dry friction at the same joints, and how far each may go."""
+    laws = [effect for effect in o.model.effects if effect.label in labels]
+    return {
+        f'{effect.label}.{p.name}': p.leeway
+        for effect in o.model.effects
+        if any(effect is law or _dry_at(effect, law.site) for law in laws)
+        for p in effect.parameters if p.leeway
+    }  # fmt: skip
 
 
 def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:

@@ -23,7 +23,7 @@ from cg_dynamics.assemble import acting_effects, parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
-from cg_sysid.identification import kept_fits, torque_error
+from cg_sysid.identification import along_motion, kept_fits, torque_error
 from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
@@ -54,6 +54,7 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+LOST = 0.1  # share of the variance of the data, from which a simulation goes its own way
 BACK = 5  # steps across a valley after one uphill, at most
 CLOSE = 1e6  # chi2/N; farther from the noise nobody needs the floor of a valley
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
@@ -323,8 +324,13 @@ def fit(
         stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
         if by_torque:
             trial = attempt(problem, theta, motions, longest)
-            if trial is not None and trial.point(weight) is not None:
+            if _resembles(trial, weight):
                 stages = []  # the torques have led the way
+            elif stages:
+                trial = attempt(problem, theta, motions, stages[0])
+            theta, motions, trial = _around(
+                problem, theta, motions, stages[0] if stages else longest, weight, trial
+            )
         end, trial = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
             reach, progress, None if stages else trial,
@@ -363,6 +369,40 @@ def fit(
         converged=end.converged,
     )
     return replace(result, warnings=tuple(_warnings(result, bounds or ()))) if sure else result
+
+
+def _resembles(trial: Trial | None, weight: float) -> bool:
+    """Whether a simulation follows the data: of no output is it off by what that varies by."""
+    if trial is None or trial.point(weight) is None:
+        return False
+    varies = np.array([
+        np.nansum(((t.outputs - np.nanmean(t.outputs, axis=0)) / t.sigma) ** 2, axis=0)
+        for t in trial.problem.data_sets
+    ])  # fmt: skip
+    return bool((trial.sse.sum(axis=0) < LOST * varies.sum(axis=0)).all())
+
+
+def _around(
+    problem: Problem,
+    theta: np.ndarray,
+    motions: list[np.ndarray],
+    horizon: float,
+    weight: float,
+    trial: Trial | None,
+) -> tuple[np.ndarray, list[np.ndarray], Trial | None]:
+    """The robot settled around what torques say of a rotor that moves by itself.
+
+    Of its gap or its spring they know more than of what the robot weighs. Let go together, teeth
+    that meet at wrong times get soft, and do not come back.
+    """
+    told = tuple(f'{e.label}.' for e in problem.model.effects if along_motion.follows(e))
+    kept = np.array([bool(told) and u.name.startswith(told) for u in problem.unknowns])
+    if trial is None or not kept.any():
+        return theta, motions, trial
+    found = _minimise(
+        problem, theta, motions, horizon, weight, 12, 3e-2, np.inf, kept=kept, trial=trial
+    )
+    return found.theta, found.motions, found.trial
 
 
 def _descend(
@@ -462,6 +502,7 @@ def _minimise(
     valley: Valley = NEAR,
     damping: float = DAMPING,
     trial: Trial | None = None,
+    kept: np.ndarray | None = None,
 ) -> _Descent:
     lower = np.array(
         [
@@ -481,6 +522,8 @@ def _minimise(
         """Unknowns that stay where they are, shape (k,)."""
         _, gradient, _ = reduced(point, 0.0)
         at_bounds = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+        if kept is not None:
+            at_bounds |= kept
         return at_bounds | _unseen(problem, theta, point, weight) if leading else at_bounds
 
     # The border's weight follows what is still to be gained (a central path): whoever meets the

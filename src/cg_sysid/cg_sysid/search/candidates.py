@@ -598,8 +598,6 @@ def _short_fits(
     found = []
     for (model, start), at in starts:
         try:
-            if at is not None:
-                at = _around_what_torques_say(task, model, train, only, at)
             screened = _screened(task, model, train, only, start, at=at, iterations=iterations)
             found.append((screened, model))
         except IdentificationError as error:
@@ -607,28 +605,6 @@ def _short_fits(
     if not found:
         raise failure
     return sorted(found, key=lambda pair: cost(pair[0]))
-
-
-def _around_what_torques_say(
-    task: Task,
-    model: Model,
-    train: Sequence[DataSet],
-    only: Sequence[str] | None,
-    at: Mapping[str, float],
-) -> Mapping[str, float]:
-    """Where a look sets out, from what torques say: the robot settled around its effect.
-
-    Of a gap or a spring torques know more than of what the robot weighs. Let go together, teeth
-    that meet at wrong times get soft, and do not come back.
-    """
-    tried = effect_of(task)
-    if tried is None or not along_motion.follows(tried):
-        return at
-    own = f'{_label(task)}.'
-    unknowns = unknowns_of(model, only, task.bounds)
-    others = [u.name for u in unknowns if not u.name.startswith(own)]
-    model = model.with_values({n: v for n, v in at.items() if n.startswith(own)})
-    return {**at, **_numbers(_screened(task, model, train, others, at=at))}
 
 
 def cost(found: Fit) -> float:
