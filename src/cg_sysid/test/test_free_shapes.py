@@ -7,12 +7,13 @@ import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes
+from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes, with_shapes_of_causes
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, try_candidate
 from cg_sysid.search.ranking import effect_name
 
 TRUE, OTHER = 'coulomb_friction', 'position_dependent_friction'
+SURELY = 3.3  # standard deviations: 99.9 % of intervals hold
 HARD = 3e-4  # rad/s, over which the machine's friction turns; the law of a candidate takes 0.01
 
 
@@ -81,3 +82,41 @@ def test_where_shapes_are_free_already_nothing_is_fitted(search, monkeypatch):
     monkeypatch.setattr(work.halving, 'fit', None)
     known = replace(wrong, base=base)
     assert compared_with_free_shapes(work, known) is known
+
+
+def _level(o):
+    names = [u.name for u in o.train.unknowns]
+    return o.train.values[names.index(f'{o.label}.torque')]
+
+
+def test_the_last_fit_has_the_shape_of_the_machine(search):
+    work, comparison = search
+    (o,) = (o for c, o in comparison.ranked if effect_name(c.label) == TRUE)
+    shaped = with_shapes_of_causes(work, o)
+    rate = f'{o.label}.transition_rate'
+    names = [u.name for u in shaped.train.unknowns]
+    assert shaped.train.values[names.index(rate)] < 3 * HARD
+    level = names.index(f'{o.label}.torque')
+    off = abs(shaped.train.values[level] - 2.3)
+    assert off < SURELY * shaped.train.sigmas[level]
+    assert off < 0.2 * abs(_level(o) - 2.3)
+    assert shaped.train.normalised_error < 0.1 * o.train.normalised_error
+    # It is as good as it gets now, and what has its shapes free is left alone.
+    assert with_shapes_of_causes(work, shaped) is shaped
+
+
+def test_at_the_noise_shapes_stay(search, monkeypatch):
+    work, comparison = search
+    o = comparison.ranked[0][1]
+    quiet = [replace(side, mse=np.ones_like(side.mse)) for side in (o.train, o.held)]
+    at_noise = replace(o, train=quiet[0], held=quiet[1])
+    monkeypatch.setattr(work.halving, 'fit', None)
+    assert with_shapes_of_causes(work, at_noise) is at_noise
+
+
+def test_a_shape_that_explains_no_held_out_record_is_not_taken(search, monkeypatch):
+    work, comparison = search
+    o = comparison.ranked[0][1]
+    worse = replace(o, held=replace(o.held, mse=1.01 * o.held.mse))
+    monkeypatch.setattr(work.halving, 'fit', lambda tasks, what: [worse])
+    assert with_shapes_of_causes(work, o) is o

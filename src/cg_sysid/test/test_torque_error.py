@@ -313,6 +313,17 @@ def test_a_fit_with_play_sets_out_from_torques():
     assert np.median(errors) < 1.1
 
 
+def test_what_nothing_drives_does_not_lose_its_weight():
+    """All terms of a pole's equation grow with its mass: without one they would leave no error."""
+    believed = Model.from_text(CART_POLE)
+    machine = believed.with_values({'cart_mass': 1.02}).with_effect('backlash', **PLAY)
+    data_sets = prepare(believed, [ride(machine, k) for k in range(2)])
+    found = fit_by_torque(machine, data_sets).values
+    assert found['pole_mass'] == pytest.approx(1.0, rel=0.03)
+    assert found['backlash.rotor_inertia'] == pytest.approx(PLAY['rotor_inertia'], rel=0.03)
+    assert found['backlash.gap'] == pytest.approx(PLAY['gap'], rel=0.2)  # the noise narrows it
+
+
 @pytest.mark.parametrize(
     ('name', 'hidden'),
     [

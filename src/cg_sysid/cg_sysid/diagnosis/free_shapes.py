@@ -83,7 +83,8 @@ def with_shapes_of_causes(work: Workspace, o: Outcome) -> Outcome:
     found = work.halving.fit([task], title)[0]
     if not isinstance(found, Outcome):
         return o
-    ((judged, found),) = work.selection.compare(o, [replace(found, label=o.label)]).ranked
+    found = with_hard_friction(work, replace(found, label=o.label))
+    ((judged, found),) = work.selection.compare(o, [found]).ranked
     earned = judged.evidence > settings.SELECTION.earned and judged.held_gain > 0
     return found if earned else o
 
@@ -115,7 +116,8 @@ def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
     if bounds == o.task.bounds:
         return o
     title = f'{title_of(work.added(o))}, with hard friction'
-    hard = work.halving.fit([_again(o, bounds)], title)[0]
+    task = replace(_again(o, bounds), thorough=o.task.thorough, iterations=o.task.iterations)
+    hard = work.halving.fit([task], title)[0]
     return (
         replace(hard, label=o.label) if isinstance(hard, Outcome) and chi2(hard) < chi2(o) else o
     )

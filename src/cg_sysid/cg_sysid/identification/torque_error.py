@@ -500,7 +500,7 @@ def _balance(model: Model, e: Equations, setup: Setup) -> ca.SX:
     """
     own = ca.diag(e.mass_matrix)
     believed = ca.substitute(own, e.p, parameter_vector(model, setup))
-    driven = _driving(model, setup).any(axis=0)
+    driven = np.any(_driving(model, setup) != 0, axis=0)
     return ca.vertcat(*(
         e.imbalance[k] if driven[k] else e.imbalance[k] * believed[k] / own[k]
         for k in range(e.coordinates)
