@@ -11,6 +11,7 @@ from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import score
+from cg_sysid.search import model_selection
 from cg_sysid.search.candidates import Task, fit_to_all, try_candidate
 from cg_sysid.search.model_selection import ModelSelection
 from cg_sysid.search.nuisance import with_nuisances
@@ -55,6 +56,21 @@ def test_a_joint_fit_is_at_least_as_good(fitted):
         # What it gains is what values fitted to one half lose on the other, by chance.
         gain = mine - found.squares - found.belief
         assert -0.1 < gain < 5 * len(found.unknowns)
+
+
+@pytest.mark.parametrize(('explained', 'compared'), [(4.9, True), (5.1, False)])
+def test_only_a_push_that_explains_little_is_compared_with_friction(
+    fitted, monkeypatch, explained, compared
+):
+    selection, base, (one, _), _ = fitted
+    impulse = replace(one.train.unknowns[0], each='record')
+    sigmas = tuple(np.ones(1) for _ in one.train.motions)
+    event = replace(one, train=replace(one.train, own=(impulse,), own_sigmas=sigmas))
+    monkeypatch.setattr(model_selection, 'explained_by', lambda base, o: explained)
+    monkeypatch.setattr(model_selection, 'within_friction', lambda o: ['no more than friction'])
+    assert ('no more than friction' in selection.judge(base, event, 50.0).reason) == compared
+    # What all records share is no event.
+    assert 'no more than friction' not in selection.judge(base, one, 50.0).reason
 
 
 def test_twins_are_level_wherever_their_fits_to_one_half_ended(fitted):

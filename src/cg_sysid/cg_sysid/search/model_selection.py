@@ -182,7 +182,7 @@ class ModelSelection:
                 f'leaves {100 * left:.0f} % of the error, at most '
                 f'{100 * settings.SELECTION.mishap:.0f} % allowed'
             )
-        if eventful:
+        if eventful and explained < settings.EVENTS.little:
             reasons += within_friction(o)
         own = own_parameters(o)
         # What sound robots have lies at the edge of what is a cause.

@@ -179,8 +179,10 @@ class Events:
         piece_iterations: Of such a fit.
         before_s: Before a spoilt piece: what happened may have begun there, s.
         followed: Peaks from which a fit goes on.
-        of_friction: Share of the dry friction of a joint, below which an event is an error of that
-            friction: real friction differs by more from place to place.
+        little: Error that an event explains, in standard deviations of the noise, up to which it
+            may be an error of friction.
+        of_friction: Share of the dry friction of a joint, below which it then is: real friction
+            differs by more from place to place.
     """
 
     sure: float = 5.0
@@ -193,6 +195,7 @@ class Events:
     piece_iterations: int = 8
     before_s: float = 0.5
     followed: int = 3
+    little: float = 5.0
     of_friction: float = 0.02
 
 
