@@ -16,6 +16,7 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.torque_error import can, fit_by_torque, fits_by_torque
 from cg_sysid.identification.windows import followed
+from cg_sysid.search import candidates
 from cg_sysid.search.candidates import (
     Task,
     candidates_for,
@@ -360,3 +361,38 @@ def test_a_start_whose_sensitivities_run_away_stays_where_it_is(believed, monkey
     assert len(calls) == 3
     assert np.isfinite(found.cost)
     assert all(np.isfinite(value) for value in found.values.values())
+
+
+@pytest.mark.parametrize(
+    ('name', 'hidden', 'ruled_out'),
+    [
+        ('coulomb_friction', {'torque': 1.1e-3}, True),
+        (
+            'backlash',
+            {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3},
+            False,
+        ),
+    ],
+)
+def test_a_rotor_is_not_simulated_where_torques_speak_clearly_for_a_rival(
+    monkeypatch, name, hidden, ruled_out
+):
+    believed = finger.finger()
+    machine = believed.with_values({'tip_mass': 1.06}).with_effect(name, **hidden)
+    task = Task(believed, ('backlash', None), rival=('coulomb_friction', None))
+    if ruled_out:
+        monkeypatch.setattr(candidates, 'fit', None)
+    look = candidates.screen(task, finger.data(machine, 2, 8.0))
+    assert np.isinf(look.error) == ruled_out
+    assert bool(look.task.warm_starts) != ruled_out
+
+
+def test_likelihoods_are_compared_over_the_same_windows(believed):
+    data_sets = data(believed.with_values(OFF), believed)
+    rotor = believed.with_effect('joint_flexibility', 'shank_joint')
+    (long,), (short,), (followed,) = (
+        fits_by_torque([model], data_sets, quick=quick)
+        for model, quick in ((believed, False), (believed, True), (rotor, False))
+    )
+    assert long.rows != short.rows
+    assert short.rows == followed.rows

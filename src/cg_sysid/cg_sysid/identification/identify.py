@@ -54,6 +54,7 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+SETTLING = 12  # iterations of a robot around a rotor, at most
 LOST = 0.1  # share of the variance of the data, from which a simulation goes its own way
 BACK = 5  # steps across a valley after one uphill, at most
 CLOSE = 1e6  # chi2/N; farther from the noise nobody needs the floor of a valley
@@ -329,8 +330,9 @@ def fit(
             elif stages:
                 trial = attempt(problem, theta, motions, stages[0])
             theta, motions, trial = _around(
-                problem, theta, motions, stages[0] if stages else longest, weight, trial
-            )
+                problem, theta, motions, stages[0] if stages else longest, weight,
+                min(SETTLING, 2 * iterations), reach, trial,
+            )  # fmt: skip
         end, trial = _descend(
             problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
             reach, progress, None if stages else trial,
@@ -388,6 +390,8 @@ def _around(
     motions: list[np.ndarray],
     horizon: float,
     weight: float,
+    iterations: int,
+    reach: float,
     trial: Trial | None,
 ) -> tuple[np.ndarray, list[np.ndarray], Trial | None]:
     """The robot settled around what torques say of a rotor that moves by itself.
@@ -395,12 +399,14 @@ def _around(
     Of its gap or its spring they know more than of what the robot weighs. Let go together, teeth
     that meet at wrong times get soft, and do not come back.
     """
-    told = tuple(f'{e.label}.' for e in problem.model.effects if along_motion.follows(e))
+    told = tuple(
+        f'{e.label}.' for e in problem.model.effects if e.elastic and along_motion.follows(e)
+    )
     kept = np.array([bool(told) and u.name.startswith(told) for u in problem.unknowns])
     if trial is None or not kept.any():
         return theta, motions, trial
     found = _minimise(
-        problem, theta, motions, horizon, weight, 12, 3e-2, np.inf, kept=kept, trial=trial
+        problem, theta, motions, horizon, weight, iterations, 3e-2, reach, kept=kept, trial=trial
     )
     return found.theta, found.motions, found.trial
 

@@ -228,17 +228,20 @@ def fits_by_torque(
     scale: np.ndarray | None = None,
     at: Mapping[str, float] | None = None,
     followed: int | None = None,
+    quick: bool = False,
 ) -> list[TorqueFit]:
     """The same for models that differ in their values only, from each; none without a record.
 
     Those that differ in nothing that the torques see, as in a delay, are fitted once. Of more than
-    `followed` fits the best go on to their minimum, after the first few iterations of all.
+    `followed` fits the best go on to their minimum, after the first few iterations of all. With
+    `quick` the windows are those of a rotor that moves by itself, whether there is one or not:
+    likelihoods are compared over the same.
     """
     names = seen_by_torques(models[0])
     unknowns = [
         tuple(u for u in unknowns_of(model, only, bounds) if u.name in names) for model in models
     ]
-    problems = problems_of(models[0], data_sets, unknowns[0])
+    problems = problems_of(models[0], data_sets, unknowns[0], quick)
     if not problems:
         return []
     seen = [p.sees() for p in problems]
@@ -454,11 +457,12 @@ class Problem:
 
 
 def problems_of(
-    model: Model, data_sets: Sequence[DataSet], unknowns: Sequence[Unknown]
+    model: Model, data_sets: Sequence[DataSet], unknowns: Sequence[Unknown], quick: bool = False
 ) -> list[Problem]:
     """What is measured, by set-up; unknowns are those that torques see (seen_by_torques)."""
     plain, effects = apart(model)
-    shorter, longest = (SHORTER, ENOUGH_S / len(data_sets)) if effects else (1.0, np.inf)
+    quick = quick or bool(effects)
+    shorter, longest = (SHORTER, ENOUGH_S / len(data_sets)) if quick else (1.0, np.inf)
     by_setup: dict[Setup, list[DataSet]] = {}
     for data_set in data_sets:
         by_setup.setdefault(data_set.setup, []).append(data_set)

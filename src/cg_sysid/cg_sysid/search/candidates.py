@@ -45,6 +45,8 @@ class Task:
             file's numbers is not, it goes on from there.
         first: Fit of the base to an excerpt of the records, for looks in the same way.
         reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
+        rival: Effect and place of which a look came near the noise: a rotor that leaves far more
+            of the torques than that is not simulated.
     """
 
     model: Model
@@ -57,6 +59,7 @@ class Task:
     base: Fit | None = None
     first: Fit | None = None
     reach: float = np.inf
+    rival: tuple[str, str | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class Screening:
     Attributes:
         label: Label of the effect.
         task: What to go on with.
-        error: chi2/N of these seconds; NaN where they cannot tell.
+        error: chi2/N of these seconds; NaN where they cannot tell, infinite where torques do.
     """
 
     label: str
@@ -159,11 +162,17 @@ def screen(task: Task, train: Sequence[DataSet]) -> Screening | Failure:
             )
             warm_starts = tuple(sorted([beyond, *warm_starts], key=cost))
             warm_starts = warm_starts[: settings.SCREENING.followed]
+    except RuledOut:
+        return Screening(label, task, np.inf)
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return Failure(str(error))
     return Screening(
         label, replace(task, warm_starts=warm_starts), warm_starts[0].normalised_error
     )
+
+
+class RuledOut(Exception):
+    """The torques speak clearly for a rival."""
 
 
 def led_on(screening: Screening, task: Task) -> Screening:
@@ -564,6 +573,8 @@ def _all_screened(
     moved = (u.name for u in unknowns_of(starts[0][0], bounds=task.bounds))
     only = [name for name in moved if name not in kept] if kept else None
     led = _by_torque(task, starts, train, only)
+    if task.first is not None and task.first.normalised_error < settings.NOISE.at_noise:
+        led = led[: 1 if led[0][1] is not None else None]  # little is left: it is not far
     if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
         heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
         ahead = heats[: settings.SCREENING.followed]
@@ -646,6 +657,11 @@ def _by_torque(
     found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
     if not found:
         return led
+    if task.rival is not None and tried is not None and tried.elastic:
+        rival = next(_starting_models(replace(task, effect=task.rival)))
+        beside = torque_error.fits_by_torque([rival], few, None, task.bounds, at=at, quick=True)
+        if min(f.deviance for f in found) > beside[0].deviance + settings.SCREENING.clearly:
+            raise RuledOut
     led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led

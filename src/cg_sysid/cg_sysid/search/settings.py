@@ -24,6 +24,8 @@ class Screening:
         following: Iterations of each of these on whole records, before the best of them is chosen.
         same: Ratio of the errors of two fits that may be one minimum.
         alike: Relative difference of an effect's parameters there.
+        clearly: Deviance (-2 log likelihood) of the torques by which a rotor that is worse than a
+            rival near the noise is not simulated.
     """
 
     lengths_s: tuple[float, ...] = (2.0, 5.0)
@@ -37,6 +39,7 @@ class Screening:
     following: int = 8
     same: float = 1.01
     alike: float = 0.1
+    clearly: float = 100.0
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,10 @@ class SuccessiveHalving:
         reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
         if by_belief:
             reach = min(reach, _at_stake(base.first))
-        heavy = [replace(t, reach=reach) for t in others if _is_heavy(t)]
+        ahead = min(screenings, key=_known, default=None)
+        near = ahead is not None and _known(ahead) < settings.NOISE.quick
+        rival = ahead.task.effect if ahead is not None and near else None
+        heavy = [replace(t, reach=reach, rival=rival) for t in others if _is_heavy(t)]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
