@@ -674,7 +674,8 @@ def _by_torque(
         others = ([v for n, v in found[i].values.items() if n.startswith(own)] for i in told)
         if not any(np.allclose(numbers, o, rtol=settings.SCREENING.alike) for o in others):
             told.append(k)
-    return [led[k] for k in told[: settings.SCREENING.followed]]
+    # A look at a law without states is short: torques need not choose among its starts.
+    return [led[k] for k in (told[: settings.SCREENING.followed] if tried.states else told)]
 
 
 def _starting_models(task: Task):
