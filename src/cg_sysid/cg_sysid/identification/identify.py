@@ -374,7 +374,7 @@ def fit(
 
 
 def _resembles(trial: Trial | None, weight: float) -> bool:
-    """Whether a simulation follows the data: of no output is it off by what that varies by."""
+    """Whether a simulation follows the data: each output is off by less than LOST allows."""
     if trial is None or trial.point(weight) is None:
         return False
     varies = np.array([
