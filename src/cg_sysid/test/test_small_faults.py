@@ -4,21 +4,24 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import hanging_arm
 import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis import small_faults
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
+from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen
-from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen, try_candidate
+from cg_sysid.search.model_selection import Comparison, at_noise
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
 
 EFFECTS = (
@@ -278,6 +281,33 @@ def test_an_effect_by_another_law_is_that_effect_and_not_two(
     assert found.extended.held.normalised_error < 1.1
     value, sigma, _ = found.causes[0].parameters[name]
     assert abs(value - true) < 4 * sigma < 0.4 * true
+
+
+def test_what_moves_beside_one_joint_does_not_contest_small_faults_at_others():
+    """Friction that bends sharply at thigh and shank, of an arm of three joints."""
+    levels = {f'coulomb_friction@{joint}.torque': 0.2 for joint in ('thigh_joint', 'shank_joint')}
+    believed = hanging_arm.nominal().with_values(levels)
+    machine = believed.with_values({
+        f'coulomb_friction@{joint}.knee': 1.0 for joint in ('thigh_joint', 'shank_joint')
+    })  # fmt: skip
+    train, held = (
+        prepare(believed, [hanging_arm.recorded(machine, 4.0, seed) for seed in seeds])
+        for seeds in ((1, 3, 4), (2,))
+    )
+    work = Workspace(believed, train, held, Options(workers=1), lambda *_: None, None, Deadline())
+    model, bounds = with_nuisances(believed, work.setups())
+    plain, faulty = (
+        try_candidate(task, train, held) for task in (Task(believed), Task(model, bounds=bounds))
+    )
+    off = {name.rpartition('.')[0] for name in small_faults.shapes_off(faulty)}
+    assert {f'coulomb_friction@{joint}' for joint in ('thigh_joint', 'shank_joint')} <= off
+    assert at_noise(faulty)
+    idle = small_faults.beside_one_joint(work, plain, faulty)
+    assert ('backlash', 'thigh_joint') in idle
+    assert ('presliding_friction', 'hip_joint') in idle
+    assert not {'stribeck_friction', 'torque_bias', 'actuator_delay'} & {name for name, _ in idle}
+    # Where they leave more than noise, or show at one joint only, anything may be behind them.
+    assert small_faults.beside_one_joint(work, plain, plain) == []
 
 
 def test_small_faults_stay_within_their_bounds(nominal):

@@ -9,7 +9,14 @@ from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, candidates_for, chi2, first_seconds
+from cg_sysid.search.candidates import (
+    Outcome,
+    Task,
+    candidates_for,
+    chi2,
+    first_seconds,
+    rival_of,
+)
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import title_of
@@ -17,21 +24,26 @@ from cg_sysid.search.successive_halving import Effects
 from cg_sysid.search.torque_screening import scores
 
 
-def compare(work: Workspace, base: Outcome, beaten: float = np.inf) -> Comparison:
-    """The library in competition on top of a base, and with what came to chi2/N `beaten`."""
+def compare(
+    work: Workspace, base: Outcome, beaten: Outcome | None = None, idle: Effects = ()
+) -> Comparison:
+    """The library, less what is idle, in competition on top of a base and with what is beaten."""
     added = work.added(base)
     key = added, bool(base.task.bounds)
     if key not in work.comparisons:
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
-        effects = worth_a_look(work, base)
+        effects = [effect for effect in worth_a_look(work, base) if effect not in idle]
         base, task = led_deeper(work, base, effects, title)
+        error = np.inf
+        if beaten is not None:
+            error, task = beaten.train.normalised_error, replace(task, rival=rival_of(beaten))
         work.under_way = base
         outcomes: list[Outcome] = []
         aside: list[str] = []
         if not done(work, base):
             outcomes, aside = work.halving.run(
-                task, effects, title, beaten, work.selection.to_be_earned(base),
+                task, effects, title, error, work.selection.to_be_earned(base),
                 base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
         comparison = less_shapes(work, work.selection.compare(base, outcomes))

@@ -52,7 +52,7 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
             log.info('without %s: %s', label, lean)
             return None
         # Who would take the place has to come up to what is there.
-        compare(work, lean, with_law(work, final).train.normalised_error)
+        compare(work, lean, with_law(work, final))
     comparison = work.comparisons[key]
     # The fit beside the others may have been better, or the only one that went through.
     ranked = comparison.of(label)

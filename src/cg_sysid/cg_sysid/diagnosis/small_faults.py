@@ -4,7 +4,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
-from cg_sysid.diagnosis.comparing import alone, compare, refitted, worth_a_look
+from cg_dynamics.effects import LIBRARY
+from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted, worth_a_look
 from cg_sysid.diagnosis.free_shapes import with_hard_friction
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
@@ -27,6 +28,7 @@ from cg_sysid.search.nuisance import (
 )
 from cg_sysid.search.ranking import Candidate, effect_name
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.successive_halving import Effects
 from cg_sysid.text import measured
 
 log = logging.getLogger(__name__)
@@ -41,6 +43,8 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     model, bounds = with_nuisances(o.model, work.setups())
     title = f'{title_of(work.added(o))}, with small faults'
     task = Task(model, events=o.events, bounds=bounds)
+    if not at_noise(o):
+        task = replace(task, reach=settings.DOUBT.most_of_it * o.train.normalised_error)
     if torque_error.can(model):
         # Torques lead to the same minimum with small faults and without: it is not far from there.
         task = replace(task, warm_starts=(started_from(o.train, model, bounds),))
@@ -122,7 +126,7 @@ def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcom
     """
     if faulty is plain or settled(plain):
         return None
-    comparison = compare(work, plain, faulty.train.normalised_error)
+    comparison = compare(work, plain, faulty, beside_one_joint(work, plain, faulty))
     plain, winner = comparison.base, comparison.winner()
     if winner is None:
         return plain if settled(plain) else None
@@ -143,6 +147,22 @@ def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcom
         return None
     work.note(comparison, label)
     return refitted(work, winner[1])
+
+
+def beside_one_joint(work: Workspace, plain: Outcome, faulty: Outcome) -> Effects:
+    """What cannot take the place of small faults at several joints, as it moves beside one.
+
+    A rotor, a bristle or a lag changes what its own joint gets. Where small faults come to the
+    noise, those at other joints would have to stay.
+    """
+    if not at_noise(faulty):
+        return []
+    off = {name.rpartition('.')[0] for name in shapes_off(faulty)}
+    places = {effect.at for effect in faulty.model.effects if effect.label in off}
+    return [
+        (name, at) for name, at in effects_on(work, plain)
+        if LIBRARY[name](plain.model.mechanism, at).states and places - {at, None}
+    ]  # fmt: skip
 
 
 def of_size(work: Workspace, comparison: Comparison) -> Comparison:
@@ -235,16 +255,22 @@ def small_faults_of(o: Outcome) -> list[str]:
 
 def shapes(o: Outcome) -> list[str]:
     """Laws that have another shape than the model states, in words."""
-    found = []
+    return [
+        f'{name} = {measured(value, sigma, unit)} and not {measured(stated, None, unit)}: '
+        'the shape of a law, which texts and machines draw differently'
+        for name, (value, sigma, stated, unit) in shapes_off(o).items()
+    ]
+
+
+def shapes_off(o: Outcome) -> dict[str, tuple[float, float, float, str]]:
+    """The same: full name -> (value, standard deviation, what the model states, unit)."""
+    found = {}
     for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True):
         if u.name not in o.task.bounds or not o.model.declarations[u.name].leeway:
             continue
         off = abs(u.to_coordinate(v) - u.to_coordinate(u.prior))
         if off > settings.DOUBT.shows * (s / v if u.logarithmic else s):
-            found.append(
-                f'{u.name} = {measured(v, s, u.unit)} and not {measured(u.prior, None, u.unit)}: '
-                'the shape of a law, which texts and machines draw differently'
-            )
+            found[u.name] = float(v), float(s), u.prior, u.unit
     return found
 
 

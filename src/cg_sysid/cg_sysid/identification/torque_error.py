@@ -12,6 +12,13 @@ elsewhere. So it says where a fit by simulation error sets out, and which candid
 Position, rate and acceleration come from local polynomials. Torques are averaged with the weights
 with which such an acceleration averages the true one, so that both sides have seen the same: of a
 constant inertia (TE) is exact, however fast it moves.
+
+Where friction turns within a window a row is far off, so rows are distributed as Student's t
+
+    -2 log L = sum (nu + 1) log(1 + (r/s)^2 / nu) + 2 log s,   nu = 4                          (T)
+
+with s, one for each coordinate, the most likely: a fit is ranked by what it leaves, and by no
+weights that another has chosen.
 """
 
 import functools
@@ -39,13 +46,14 @@ DEGREE = 4  # of the polynomial
 STRIDE_S = 0.04  # between rows: windows that share less than half of their samples
 ITERATIONS = 25
 HEAT = 6  # iterations from each of many starts, before the best of them go on
-SETTLED = 1e-4  # relative change of the cost
+SETTLED = 1e-4  # of the deviance, for each residual
 DAMPING = 1e-3  # Levenberg-Marquardt, at first
 MOST_DAMPING = 1e6
 PATIENCE = 4  # steps that may gain little where a full one promises more
 STRAINED = 2.5  # tolerances that a value lies off its belief
 RUN_AWAY = 1e6  # standard deviations, in which no state is that moves with its joint
-CAP = 4.0  # standard deviations from which a row counts less: rates that turn within a window
+TAILS = 4.0  # nu of (T)
+SCALED = 1e-3  # relative change of s at which it has settled
 
 
 @dataclass(frozen=True)
@@ -79,24 +87,15 @@ class TorqueFit:
         values: Full parameter name -> value.
         rms: Of the residual of each free coordinate, N m (N), shape (m,).
         relative: That over the torque that acted there, shape (m,); NaN where nothing drives.
-        cost: Sum of squared residuals over `scale`, large ones capped, and of the belief.
-        rows: Number of rows.
-        scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,).
+        deviance: (T) and the squared distance from the belief; infinite of a rotor that runs away.
+        scale: s of (T), N m (N), shape (m,).
     """
 
     values: Mapping[str, float]
     rms: np.ndarray
     relative: np.ndarray
-    cost: float
-    rows: int
+    deviance: float
     scale: np.ndarray
-
-    @property
-    def deviance(self) -> float:
-        """-2 log likelihood, but for a constant: it ranks fits that chose their weights."""
-        if not np.isfinite(self.cost):
-            return np.inf
-        return self.cost + 2 * self.rows * float(np.log(self.scale).sum())
 
 
 def can(model: Model) -> bool:
@@ -202,7 +201,6 @@ def fit_by_torque(
     data_sets: Sequence[DataSet],
     only: Sequence[str] | None = None,
     bounds: Mapping[str, float] | None = None,
-    scale: np.ndarray | None = None,
     at: Mapping[str, float] | None = None,
 ) -> TorqueFit | None:
     """Identify what the torques show of a model; None where no record can be used.
@@ -212,11 +210,9 @@ def fit_by_torque(
         data_sets: Prepared records.
         only: As of `identify.fit`.
         bounds: As of `identify.fit`.
-        scale: Standard deviation of the residual of each coordinate, N m (N), shape (m,), by which
-            fits are compared; by default what is left of this one.
         at: Set out from these values (full name -> value) instead of those of the model.
     """
-    found = fits_by_torque([model], data_sets, only, bounds, scale, at)
+    found = fits_by_torque([model], data_sets, only, bounds, at)
     return found[0] if found else None
 
 
@@ -225,7 +221,6 @@ def fits_by_torque(
     data_sets: Sequence[DataSet],
     only: Sequence[str] | None = None,
     bounds: Mapping[str, float] | None = None,
-    scale: np.ndarray | None = None,
     at: Mapping[str, float] | None = None,
     followed: int | None = None,
     quick: bool = False,
@@ -256,12 +251,12 @@ def fits_by_torque(
     firsts = {key: keys.index(key) for key in keys}
     many = followed is not None and len(firsts) > followed
     fitted = {
-        key: _best(starts[k], unknowns[k], scale, at or {}, HEAT if many else ITERATIONS)
+        key: _best(starts[k], unknowns[k], at or {}, HEAT if many else ITERATIONS)
         for key, k in firsts.items()
     }
     for key in sorted(fitted, key=lambda key: fitted[key].deviance)[:followed] if many else ():
         k = firsts[key]
-        fitted[key] = _descend(starts[k], unknowns[k], scale, fitted[key].values)
+        fitted[key] = _descend(starts[k], unknowns[k], fitted[key].values)
     found = []
     for key, own in zip(keys, unknowns, strict=True):
         # What the torques do not see is left where it was.
@@ -275,7 +270,6 @@ def fits_by_torque(
 def _best(
     problems: Sequence['Problem'],
     unknowns: Sequence[Unknown],
-    scale: np.ndarray | None,
     at: Mapping[str, float],
     iterations: int,
 ) -> TorqueFit:
@@ -284,46 +278,46 @@ def _best(
     What an effect more could take over from strained numbers lies far off, along a curved valley
     of numbers that the torques cannot tell apart.
     """
-    found = _descend(problems, unknowns, scale, at, iterations)
+    found = _descend(problems, unknowns, at, iterations)
     strained = any(
         abs(u.to_coordinate(at[u.name]) - u.to_coordinate(u.prior)) > STRAINED * u.tolerance
         for u in unknowns if u.name in at
     )  # fmt: skip
     if not strained:
         return found
-    afresh = _descend(problems, unknowns, found.scale, {}, iterations)
-    return min(found, afresh, key=lambda fitted: fitted.cost)
+    afresh = _descend(problems, unknowns, {}, iterations)
+    return min(found, afresh, key=lambda fitted: fitted.deviance)
 
 
 def _descend(
     problems: Sequence['Problem'],
     unknowns: Sequence[Unknown],
-    scale: np.ndarray | None,
     at: Mapping[str, float],
     iterations: int = ITERATIONS,
 ) -> TorqueFit:
-    """From a start to the minimum: Gauss-Newton, damped.
+    """From a start to the minimum: Gauss-Newton, damped, with the weights of (T).
 
-    A start from which a rotor runs away stays where it is, at an infinite cost; so does one whose
-    sensitivities run away, at its own.
+    A start from which a rotor runs away stays where it is, at an infinite deviance; so does one
+    whose sensitivities run away, at its own.
     """
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     theta = np.array([
         np.clip(u.to_coordinate(at.get(u.name, u.prior)), *_range(u)) for u in unknowns
     ])  # fmt: skip
     tolerance = np.array([u.tolerance for u in unknowns])
-    own_scale = scale is None
+
+    def deviance_of(residual: np.ndarray, theta: np.ndarray) -> float:
+        return deviance(residual) + float((((theta - prior) / tolerance) ** 2).sum())
+
     residual = residuals(problems, unknowns, theta)
-    if scale is None:
-        scale = spread_of(residual)
     damping, patience = DAMPING, PATIENCE
-    cost = _cost(residual, scale, theta, prior, tolerance)
+    cost, little_is = deviance_of(residual, theta), SETTLED * residual.size
     for _ in range(iterations if np.isfinite(cost) else 0):
-        weight = 1 / beyond(residual / scale)
-        r = (weight * residual / scale).ravel()
+        of_rows = row_scale(residual, scale_of(residual))
+        r = (residual / of_rows).ravel()
         with np.errstate(over='ignore', invalid='ignore'):
             jacobian = derivatives(problems, unknowns, theta)
-            j = (weight[:, :, None] * jacobian / scale[:, None]).reshape(len(r), -1)
+            j = (jacobian / of_rows[:, :, None]).reshape(len(r), -1)
             h = j.T @ j + np.diag(1 / tolerance**2)
             g = j.T @ r + (theta - prior) / tolerance**2
         if not (np.isfinite(h).all() and np.isfinite(g).all()):
@@ -336,19 +330,16 @@ def _descend(
                 np.clip(t + s, *_range(u)) for t, s, u in zip(theta, step, unknowns, strict=True)
             ])  # fmt: skip
             new_residual = residuals(problems, unknowns, tried)
-            new_cost = _cost(new_residual, scale, tried, prior, tolerance)
+            new_cost = deviance_of(new_residual, tried)
             better = new_cost < cost
             damping = damping / 5 if better else 5 * damping
         if not better:
             break
         # Along what only the belief knows a damped step is short, and gains little.
-        little = cost - new_cost < SETTLED * cost
+        little = cost - new_cost < little_is
         patience -= little
-        settled = little and (promised < SETTLED * cost or not patience)
+        settled = little and (promised < little_is or not patience)
         theta, residual, cost = tried, new_residual, new_cost
-        if own_scale:
-            scale = spread_of(residual)
-            cost = _cost(residual, scale, theta, prior, tolerance)
         if settled:
             break
     acted = np.sqrt(np.mean(np.vstack([p.acted for p in problems]) ** 2, axis=0))
@@ -356,7 +347,7 @@ def _descend(
     with np.errstate(divide='ignore', invalid='ignore'):
         relative = np.where(acted > 0, rms / acted, np.nan)
     values = {u.name: u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)}
-    return TorqueFit(values, rms, relative, cost, len(residual), scale)
+    return TorqueFit(values, rms, relative, cost, scale_of(residual))
 
 
 class AlongRows:
@@ -565,24 +556,33 @@ def spread_of(residual: np.ndarray) -> np.ndarray:
     return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
 
 
-def beyond(error: np.ndarray) -> np.ndarray:
-    """By how much less rows count that are beyond CAP: of errors in standard deviations, >= 1."""
-    return np.maximum(1.0, np.abs(error) / CAP)
+def scale_of(residual: np.ndarray) -> np.ndarray:
+    """The most likely s of (T), shape (m,): each step of this makes it more likely."""
+    scale = spread_of(residual)
+    if not np.isfinite(residual).all():
+        return scale
+    settled = False
+    while not settled:
+        rows = residual / row_scale(residual, scale)
+        new = np.maximum(scale * np.sqrt(np.mean(rows**2, axis=0)), 1e-12)
+        settled, scale = bool((np.abs(new - scale) < SCALED * scale).all()), new
+    return scale
 
 
-def _cost(
-    residual: np.ndarray,
-    scale: np.ndarray,
-    theta: np.ndarray,
-    prior: np.ndarray,
-    tolerance: np.ndarray,
-) -> float:
-    """Squares near zero, straight on beyond CAP (Huber), and the belief."""
-    size = np.abs(residual / scale)
+def row_scale(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """By what to divide each residual, that least squares descend (T), shape (rows, m)."""
+    return scale * np.sqrt((TAILS + (residual / scale) ** 2) / (TAILS + 1))
+
+
+def deviance(residual: np.ndarray) -> float:
+    """(T) at its most likely s, but for a constant."""
+    scale = scale_of(residual)
+    with np.errstate(invalid='ignore'):
+        size = np.abs(residual / scale)
     if not np.all(size < RUN_AWAY):
         return np.inf
-    capped = np.where(size <= CAP, size**2, CAP * (2 * size - CAP))
-    return float(capped.sum() + (((theta - prior) / tolerance) ** 2).sum())
+    each = (TAILS + 1) * np.log1p(size**2 / TAILS)
+    return float(each.sum() + 2 * len(residual) * np.log(scale).sum())
 
 
 def apart(model: Model) -> tuple[Model, tuple[Effect, ...]]:

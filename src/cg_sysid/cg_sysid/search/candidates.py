@@ -28,6 +28,21 @@ Led = tuple[Start, Mapping[str, float] | None]  # a start, and what torques say 
 
 
 @dataclass(frozen=True, eq=False)
+class Rival:
+    """What left little: what explains the torques far worse than this is not simulated.
+
+    Attributes:
+        model: With what the file believes.
+        at: Full name -> value, as fitted.
+        bounds: Of its small faults.
+    """
+
+    model: Model
+    at: Mapping[str, float]
+    bounds: Bounds
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
     """One candidate to fit: an effect (or None for the base alone) on top of a model.
 
@@ -45,8 +60,7 @@ class Task:
             file's numbers is not, it goes on from there.
         first: Fit of the base to an excerpt of the records, for looks in the same way.
         reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
-        rival: Effect and place of which a look came near the noise: a rotor that leaves far more
-            of the torques than that is not simulated.
+        rival: What has states and has to come up to this.
     """
 
     model: Model
@@ -59,7 +73,7 @@ class Task:
     base: Fit | None = None
     first: Fit | None = None
     reach: float = np.inf
-    rival: tuple[str, str | None] | None = None
+    rival: Rival | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +187,14 @@ def screen(task: Task, train: Sequence[DataSet]) -> Screening | Failure:
 
 class RuledOut(Exception):
     """The torques speak clearly for a rival."""
+
+
+def rival_of(found: Screening | Outcome) -> Rival:
+    """What others have to come up to."""
+    if isinstance(found, Outcome):
+        return Rival(found.model, _numbers(found.train), found.task.bounds)
+    model = next(_starting_models(found.task))
+    return Rival(model, _numbers(found.task.warm_starts[0]), found.task.bounds)
 
 
 def led_on(screening: Screening, task: Task) -> Screening:
@@ -657,10 +679,11 @@ def _by_torque(
     found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
     if not found:
         return led
-    if task.rival is not None and tried is not None and tried.elastic:
-        rival = next(_starting_models(replace(task, effect=task.rival)))
-        beside = torque_error.fits_by_torque([rival], few, None, task.bounds, at=at, quick=True)
-        if min(f.deviance for f in found) > beside[0].deviance + settings.SCREENING.clearly:
+    if task.rival is not None and tried is not None and along_motion.follows(tried):
+        rival = torque_error.fits_by_torque(
+            [task.rival.model], few, None, task.rival.bounds, at=task.rival.at, quick=True
+        )
+        if min(f.deviance for f in found) > rival[0].deviance + settings.SCREENING.clearly:
             raise RuledOut
     led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):

@@ -34,6 +34,7 @@ from cg_sysid.search.candidates import (
     effect_of,
     eventful,
     led_on,
+    rival_of,
     screen,
     try_candidate,
 )
@@ -146,9 +147,9 @@ class SuccessiveHalving:
         if by_belief:
             reach = min(reach, _at_stake(base.first))
         ahead = min(screenings, key=_known, default=None)
-        near = ahead is not None and _known(ahead) < settings.NOISE.quick
-        rival = ahead.task.effect if ahead is not None and near else None
-        heavy = [replace(t, reach=reach, rival=rival) for t in others if _is_heavy(t)]
+        heavy = [replace(task, reach=reach) for task in others if _is_heavy(task)]
+        if base.rival is None and ahead and _leaves_little(ahead, base.first):
+            heavy = [replace(task, rival=rival_of(ahead)) for task in heavy]
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
@@ -374,6 +375,12 @@ def _clear(best: float, first: Fit | None) -> float:
     return best if best - 1 < (_error(first) - 1) / settings.HALVING.mostly else np.inf
 
 
+def _leaves_little(screening: Screening, first: Fit | None) -> bool:
+    """Whether a look comes near the noise, or leaves next to nothing of what the base does."""
+    of_base = 0.0 if first is None else first.normalised_error / settings.SCREENING.hopeless
+    return _known(screening) < max(settings.NOISE.quick, of_base)
+
+
 def _nothing_helps(base: Task, screenings: Sequence[Screening]) -> bool:
     """Whether much is wrong that nothing explains in the first seconds."""
     if (
@@ -398,8 +405,10 @@ def _worth_more(
     reach = min(
         reach, settings.HALVING.in_reach * errors[0], worth_having(_clear(errors[0], first), first)
     )
-    limit = max(reach, errors[min(fewest, len(errors)) - 1]) if fewest else reach
-    return [screening for screening in screenings if not screening.error > limit]
+    if fewest:
+        at_least = errors[min(fewest, len(errors)) - 1]
+        reach = max(reach, min(at_least, settings.SCREENING.hopeless * errors[0]))
+    return [screening for screening in screenings if not screening.error > reach]
 
 
 def _may_still_win(

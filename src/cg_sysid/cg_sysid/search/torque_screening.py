@@ -47,6 +47,7 @@ STARTS = 4  # of each, from which they are fitted, the best first
 KEPT = 8  # of these, that are looked at, at least
 LOOKS = 32  # and so many over the number of joints: looks at robots of few joints are cheap
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
+IDLE = 0.1  # share below which one can wait for the next round
 WORST = 2  # joints on which effects with states are looked at
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
 BLOCK = 12  # rows, 0.5 s
@@ -62,7 +63,8 @@ class Scores:
 
     Attributes:
         gains: (effect, place) -> nats that it could gain by the score; of those that have a D.
-        fitted: Of the best of these, without those of sensors and delays: nats by a torque fit.
+        fitted: Of the best of these, and of those without a D or states: nats by a torque fit. Not
+            of sensors and delays.
         worst: Joints, those of which the torques are worst explained first.
         pushed: What pushes once, where it may have: (effect, place).
     """
@@ -79,21 +81,21 @@ class Scores:
         best = max(sensors.values(), default=0.0)
         sensed = {c for c, gain in sensors.items() if gain > max(SEEN, NEAR * best)}
         # Where numbers make up for each other a torque fit may stop in the valley, or fail.
-        promised = {c: max(gain, self.gains[c]) for c, gain in self.fitted.items()}
+        promised = {c: max(gain, self.gains.get(c, 0.0)) for c, gain in self.fitted.items()}
         ordered = sorted(promised, key=lambda c: -promised[c])
         best = promised[ordered[0]] if ordered else 0.0
         kept = max(KEPT, LOOKS // len(self.worst))
         seen = sensed | {
             c
             for place, c in enumerate(ordered)
-            if promised[c] > SEEN and (place < kept or promised[c] > NEAR * best)
+            if promised[c] > max(SEEN, (IDLE if place < kept else NEAR) * best)
         }
         unseen = {
             (name, at)
             for name, at in candidates
             if (name, at) not in self.gains
-            and not _happens(name)
-            and (at is None or _joint(at) in self.worst[:WORST])
+            and (name, at) not in self.fitted
+            and _on_worst(name, at, self.worst)
         }
         # Delays are few, and smoothed torques know little of them.
         unseen |= {c for c in candidates if _late(c[0])}
@@ -136,19 +138,13 @@ def scores(
     problems = torque_error.problems_of(plain, train, unknowns)
     if fitted is None or not problems:
         return None
-    # While its scale followed what it left, it stopped short of the minimum at its last one; and
-    # whatever is put on top of it would seem to gain the rest.
-    settled = torque_error.fit_by_torque(
-        plain, train, None, bounds, scale=fitted.scale, at=fitted.values
-    )
-    fitted = settled or fitted
     theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     tolerance = np.array([u.tolerance for u in unknowns])
     residual = torque_error.residuals(problems, unknowns, theta)
     jacobian = torque_error.derivatives(problems, unknowns, theta)
     # Few rows are far off, where friction turns within a window: they count less, as in fits.
-    scale = torque_error.spread_of(residual) * torque_error.beyond(residual / fitted.scale)
+    scale = torque_error.row_scale(residual, fitted.scale)
     known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
     # The belief is as good as measurements of the numbers themselves.
     belief = np.diag(1 / tolerance)
@@ -175,27 +171,40 @@ def scores(
             of_starts.append(float(left @ left - rest @ rest) / 2)
         gains[name, at] = max(0.0, *of_starts)
         promising[name, at] = [int(k) for k in np.argsort(of_starts)[::-1][:STARTS]]
+    noise = _noise(train[0], by_motion)
+    order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
+    free = model.mechanism.kinematics(train[0].setup).names
+    worst = tuple(free[k] for k in order)
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
+    for name, at in candidates:
+        effect = LIBRARY[name](model.mechanism, at)
+        if (name, at) in gains or effect.states or _sensed(name):
+            continue
+        if _on_worst(name, at, worst):
+            follow.append((name, at))
+            promising[name, at] = list(range(len(starts_of(effect))))[:STARTS]
     gained = carry_out(
         _gain_by_fit,
         [(plain, c, promising[c], train, bounds, fitted) for c in follow],
         'what torques say',
     )
     by_fit = dict(zip(follow, gained, strict=True))
-    noise = _noise(train[0], by_motion)
-    order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
-    free = model.mechanism.kinematics(train[0].setup).names
     pushed: tuple[tuple[str, str | None], ...] = ()
     if pushers := [c for c in candidates if _happens(c[0])]:
         problems = torque_error.problems_of(plain, [*train, *held], unknowns)
         residual = torque_error.residuals(problems, unknowns, theta)
         pushed = _pushed(values, pushers, [p.motion for p in problems], residual, free)
-    return Scores(gains, by_fit, tuple(free[k] for k in order), pushed)
+    return Scores(gains, by_fit, worst, pushed)
 
 
 def _happens(name: str) -> bool:
     """Whether an effect is one of single records, as a push."""
     return any(p.each == 'record' for p in LIBRARY[name].parameters)
+
+
+def _on_worst(name: str, at: str | None, worst: Sequence[str]) -> bool:
+    """Whether something that has no D acts where torques are worst explained."""
+    return not _happens(name) and (at is None or _joint(at) in worst[:WORST])
 
 
 def _turning(rates: np.ndarray) -> np.ndarray:
@@ -336,10 +345,8 @@ def _gain_by_fit(
     own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
     starts = starts_of(LIBRARY[name](model.mechanism, at))
     extended = [without.with_effect(name, at, **starts[k]) for k in promising]
-    found = torque_error.fits_by_torque(
-        extended, train, None, own, scale=base.scale, at=base.values
-    )
-    return max(((base.cost - fitted.cost) / 2 for fitted in found), default=0.0)
+    found = torque_error.fits_by_torque(extended, train, None, own, at=base.values)
+    return max(((base.deviance - fitted.deviance) / 2 for fitted in found), default=0.0)
 
 
 def _as_predicted(
