@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import finger
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.search import candidates, settings
 from cg_sysid.search.candidates import (
+    Rival,
     Task,
     events_of,
     first_seconds,
@@ -145,6 +147,30 @@ def test_a_look_serves_beside_other_small_faults_too(nominal):
     other = Task(nominal.with_effect('torque_bias'), ('payload', None))
     halving.screen_beside([other], 'on top of another cause')
     assert asked[-1] == ('on top of another cause', 1)
+
+
+def test_what_torques_ruled_out_stays_so_beside_small_faults():
+    believed = finger.finger()
+    train = finger.data(believed.with_effect('coulomb_friction', torque=1.1e-3), 2, 8.0)
+    asked = []
+
+    def carry_out(function, arguments, what):
+        asked.append(len(arguments))
+        return [function(*a) for a in arguments]
+
+    halving = SuccessiveHalving(train, train, carry_out)
+    rival = Rival(believed.with_effect('coulomb_friction', None), {}, {})
+    model, bounds = with_nuisances(believed, [data_set.setup for data_set in train])
+    plain = Task(believed, ('backlash', None), rival=rival)
+    faulty = Task(model, ('backlash', None), bounds=bounds, rival=rival)
+    for task in (plain, faulty):
+        (look,) = halving.screen([task], 'look')
+        assert np.isinf(look.error)
+    assert asked == [1, 0]
+    # Where nothing has to be beaten it gets a look of its own.
+    assert (
+        halving.screen_beside([replace(faulty, rival=None, bounds={})], 'look')[0].error < np.inf
+    )
 
 
 def test_an_event_is_sought_before_all_others_are_fitted(nominal):

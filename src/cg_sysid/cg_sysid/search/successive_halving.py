@@ -70,10 +70,16 @@ class SuccessiveHalving:
 
         Those at the same beside other small faults lead the way.
         """
-        new = [task for task in tasks if _structure(task) not in self.screenings]
-        before = [self._known_beside(task) for task in new]
-        led = [replace(task, warm_starts=known.task.warm_starts) if known else task
-               for task, known in zip(new, before, strict=True)]  # fmt: skip
+        new, led = [], []
+        for task in tasks:
+            if _structure(task) in self.screenings:
+                continue
+            known = self._known_beside(task)
+            if known and not known.task.warm_starts:  # ruled out
+                self.screenings[_structure(task)] = known
+                continue
+            new.append(task)
+            led.append(replace(task, warm_starts=known.task.warm_starts) if known else task)
         screenings = self.carry_out(screen, [(task, self.train) for task in led], what)
         for task, screening in zip(new, screenings, strict=True):
             self.screenings[_structure(task)] = screening
@@ -91,10 +97,14 @@ class SuccessiveHalving:
     def _known_beside(self, task: Task) -> Screening | None:
         """A look at the same effect on the same causes, as one for this task."""
         for screening in self.screenings.values():
-            if not isinstance(screening, Screening) or not screening.task.warm_starts:
+            if not isinstance(screening, Screening) or screening.task.effect != task.effect:
                 continue
-            if screening.task.effect == task.effect and _causes(screening.task) == _causes(task):
+            if _causes(screening.task) != _causes(task):
+                continue
+            if screening.task.warm_starts:
                 return led_on(screening, task)
+            if np.isinf(screening.error) and task.rival is not None:
+                return replace(screening, task=task)  # to torques small faults change little
         return None
 
     def run(
