@@ -179,8 +179,17 @@ def test_of_few_joints_more_candidates_are_looked_at(joints, looks):
     laws = {('coulomb_friction', f'joint_{k}'): 30.0 - 0.1 * k for k in range(20)}
     best = ('torque_constant', None)
     fitted = laws | {best: 200.0}
-    kept = Scores(dict.fromkeys(fitted, 0.0), fitted, names).worth(list(fitted))
+    kept = Scores(fitted, fitted, names).worth(list(fitted))
     assert kept == [*list(laws)[: looks - 1], best]
+
+
+def test_what_gains_by_a_fit_and_not_by_the_score_rules_nobody_out():
+    """A torque constant may shrink all torques, and with them the masses and what is left."""
+    names = 'arm_joint', 'pendulum_joint'
+    friction, weak = ('stribeck_friction', 'arm_joint'), ('torque_constant', None)
+    for scored, kept in ((0.0, [friction, weak]), (362.0, [weak])):
+        gains, fitted = {friction: 29.0, weak: scored}, {friction: 33.0, weak: 362.0}
+        assert Scores(gains, fitted, names).worth([friction, weak]) == kept
 
 
 def test_rows_are_distributed_as_students_t():

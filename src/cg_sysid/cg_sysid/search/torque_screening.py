@@ -83,7 +83,8 @@ class Scores:
         # Where numbers make up for each other a torque fit may stop in the valley, or fail.
         promised = {c: max(gain, self.gains.get(c, 0.0)) for c, gain in self.fitted.items()}
         ordered = sorted(promised, key=lambda c: -promised[c])
-        best = promised[ordered[0]] if ordered else 0.0
+        # Torques and masses that shrink together leave less: what gains only so rules nobody out.
+        best = max((promised[c] for c in ordered if self.gains.get(c, 0.0) > SEEN), default=0.0)
         kept = max(KEPT, LOOKS // len(self.worst))
         seen = sensed | {
             c
