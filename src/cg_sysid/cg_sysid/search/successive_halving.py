@@ -74,12 +74,12 @@ class SuccessiveHalving:
         for task in tasks:
             if _structure(task) in self.screenings:
                 continue
-            known = self._known_beside(task)
-            if known and not known.task.warm_starts:  # ruled out
-                self.screenings[_structure(task)] = known
+            same = self._known_beside(task)
+            if same and not same.task.warm_starts:  # ruled out
+                self.screenings[_structure(task)] = same
                 continue
             new.append(task)
-            led.append(replace(task, warm_starts=known.task.warm_starts) if known else task)
+            led.append(replace(task, warm_starts=same.task.warm_starts) if same else task)
         screenings = self.carry_out(screen, [(task, self.train) for task in led], what)
         for task, screening in zip(new, screenings, strict=True):
             self.screenings[_structure(task)] = screening
