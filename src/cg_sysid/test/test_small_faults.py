@@ -306,7 +306,7 @@ def test_what_moves_beside_one_joint_does_not_contest_small_faults_at_others():
     assert ('backlash', 'thigh_joint') in idle
     assert ('presliding_friction', 'hip_joint') in idle
     assert not {'stribeck_friction', 'torque_bias', 'actuator_delay'} & {name for name, _ in idle}
-    # Where they leave more than noise, or show at one joint only, anything may be behind them.
+    # Where they leave more than noise anything may be behind them.
     assert small_faults.beside_one_joint(work, plain, plain) == []
 
 

@@ -150,7 +150,7 @@ def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcom
 
 
 def beside_one_joint(work: Workspace, plain: Outcome, faulty: Outcome) -> Effects:
-    """What cannot take the place of small faults at several joints, as it moves beside one.
+    """What moves beside one joint, and cannot take the place of small faults at another.
 
     A rotor, a bristle or a lag changes what its own joint gets. Where small faults come to the
     noise, those at other joints would have to stay.

@@ -19,13 +19,14 @@ class Screening:
         iterations: Of a first look.
         heat: Of these, those that all starts of a candidate are given.
         hopeless: Times the error that matters, beyond which a candidate is given no more of them.
+            A look that leaves so many times less than the base has left little.
         most_starts: Starts of one effect.
         followed: Starts that are worth a second look.
         following: Iterations of each of these on whole records, before the best of them is chosen.
         same: Ratio of the errors of two fits that may be one minimum.
         alike: Relative difference of an effect's parameters there.
-        clearly: Deviance (-2 log likelihood) of the torques by which a rotor that is worse than a
-            rival near the noise is not simulated.
+        clearly: Deviance (-2 log likelihood) of the torques by which what has states, as a rotor,
+            is not simulated where it is worse than its rival.
     """
 
     lengths_s: tuple[float, ...] = (2.0, 5.0)
