@@ -86,8 +86,9 @@ def test_a_wrong_simulation_starts_where_it_errs_least(model_file):
     data_sets = prepare(nominal, _short_pieces(machine, 0.004))
     best, found = (fit(nominal, data_sets, only=[], reweight=weighs) for weighs in (False, True))
     assert best.normalised_error > 1000
-    # The guesses of the initial motions are believed no more than the samples behind them.
-    assert found.normalised_error == pytest.approx(best.normalised_error, rel=1e-3)
+    # The guesses of the initial motions are believed no more than the samples behind them. The
+    # weighted cost is 180: the last steps would gain a tenth each, SMALL_GAIN, of that.
+    assert found.normalised_error == pytest.approx(best.normalised_error, rel=3e-3)
 
 
 def test_model_error_counts_by_its_time_and_not_by_its_samples(model_file):

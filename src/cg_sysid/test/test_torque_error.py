@@ -160,9 +160,12 @@ def test_a_push_is_seen_where_its_joint_turns_around_and_in_a_record_held_out(be
 def test_a_law_of_torque_that_gains_most_drives_out_no_delay_and_no_sensor():
     constant, late = ('torque_constant', 'hip_joint'), ('sensor_delay', None)
     off, bent, little = (('encoder_offset', f'{j}_position') for j in ('hip', 'thigh', 'shank'))
-    gains = {constant: 300.0, late: 0.5, off: 30.0, bent: 12.0, little: SEEN / 2}
+    gains = {constant: 300.0, late: 4.0, off: 30.0, bent: 12.0, little: SEEN / 2}
     found = Scores(gains, {constant: 280.0}, ('hip_joint',))
     assert found.worth(list(gains)) == [constant, late, off]
+    # Of ten machines with a delay it gained a twentieth of the best at least.
+    found = Scores(gains | {late: 0.5}, {constant: 280.0}, ('hip_joint',))
+    assert found.worth(list(gains)) == [constant, off]
     # Nor does it drive out what a torque fit failed to follow, as a load and its link.
     load = ('payload', 'shank')
     fitted = {('torque_bias', f'joint_{k}'): 200.0 for k in range(KEPT)} | {load: -1e4}

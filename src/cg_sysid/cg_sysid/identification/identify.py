@@ -48,12 +48,14 @@ from cg_sysid.records.record import Record
 from cg_sysid.text import off_by
 
 HORIZONS = (0.5, 2.0, 5.0)  # s, before the full length
+MOST = 0.8  # share of the samples, from which a horizon is as good as the full length
 BETWEEN_WEIGHTS = 8  # iterations after which the weights follow the residual
 BETWEEN_WEIGHTS_THOROUGH = 24  # the same of a thorough fit
 STEADY = 0.1  # change of the logarithm of the weights at which they count as settled
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+LEADING = 3e-2  # the same of one that only leads the way
 SETTLING = 12  # iterations of a robot around a rotor, at most
 LOST = 0.1  # share of the variance of the data, from which a simulation goes its own way
 BACK = 5  # steps across a valley after one uphill, at most
@@ -322,7 +324,8 @@ def fit(
     )  # fmt: skip
     end, trial = _End.of(kept_fits.recall(place)), None
     if end is None:
-        stages = [h for h in HORIZONS if (start.horizon if start else 0.0) < h < 0.8 * longest]
+        behind = start.horizon if start else 0.0
+        stages = [h for h in HORIZONS if behind < h and _share(data_sets, h, longest) < MOST]
         if by_torque:
             trial = attempt(problem, theta, motions, longest)
             if _resembles(trial, weight):
@@ -406,8 +409,9 @@ def _around(
     if trial is None or not kept.any():
         return theta, motions, trial
     found = _minimise(
-        problem, theta, motions, horizon, weight, iterations, 3e-2, reach, kept=kept, trial=trial
-    )
+        problem, theta, motions, horizon, weight, iterations, LEADING, reach, kept=kept,
+        trial=trial,
+    )  # fmt: skip
     return found.theta, found.motions, found.trial
 
 
@@ -437,7 +441,7 @@ def _descend(
         progress(f'fitting the first {horizon:g} s', k, len(stages) + rounds, _so_far(found))
         # The short horizons only lead the way; the belief of the file keeps them sober.
         ahead = _minimise(
-            problem, found.theta, found.motions, horizon, weight, 12, 3e-2, reach, leading=True
+            problem, found.theta, found.motions, horizon, weight, 12, LEADING, reach, leading=True
         )
         if ahead.point is not None:
             found = replace(ahead, trial=None)
@@ -445,12 +449,14 @@ def _descend(
         if found.hopeless:
             at_once, rounds = 0, 1
             break
-    drift = 0.0 if thorough else DRIFT
     led = problem.company and torque_error.can(problem.model)
     valley = FAR if thorough else NONE if led else NEAR
     damping = DAMPING
     for k in range(rounds):
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
+        # Under weights that nobody knows yet a minimum is none.
+        leads = reweight and not k and rounds > 1 and weight == 1.0
+        drift = LEADING if leads else 0.0 if thorough else DRIFT
         found = _minimise(
             problem, found.theta, found.motions, longest, weight, at_once, drift, reach,
             valley=valley, damping=damping, trial=found.trial,
@@ -462,10 +468,10 @@ def _descend(
                 'or the records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(problem, found.point) if reweight else 1.0
-        # A minimum under weights that are about to change is none yet.
+        # Nor under those that are about to change.
         steady = bool(abs(np.log(new / weight)) < STEADY)
         idle = not thorough and found.gained < at_once * max(SMALL_GAIN, drift * found.point.cost)
-        converged = steady and (found.converged or idle)
+        converged = steady and (found.converged or idle) and not leads
         if converged or found.hopeless:
             break
         weight, damping = new, found.damping if steady else DAMPING
@@ -654,6 +660,12 @@ def _unseen(problem: Problem, theta: np.ndarray, point: Point, weight: float) ->
 def _weight(problem: Problem, point: Point) -> float:
     step = np.median(np.concatenate([np.diff(data_set.time) for data_set in problem.data_sets]))
     return float(weight_of(point.sse.sum() / point.count.sum(), step))
+
+
+def _share(data_sets: Sequence[DataSet], horizon: float, longest: float) -> float:
+    """Of the samples over the longest horizon: those within a shorter one."""
+    within = [np.searchsorted(t.time, [horizon, longest], side='right') for t in data_sets]
+    return float(np.divide(*np.sum(within, axis=0)))
 
 
 def _demanded(away: Sequence[np.ndarray], sigmas: Sequence[np.ndarray]) -> float:

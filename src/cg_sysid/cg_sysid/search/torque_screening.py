@@ -48,6 +48,7 @@ KEPT = 8  # of these, that are looked at, at least
 LOOKS = 32  # and so many over the number of joints: looks at robots of few joints are cheap
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 IDLE = 0.1  # share below which one can wait for the next round
+LATE = 1e-2  # share below which a delay can wait too
 WORST = 2  # joints on which effects with states are looked at
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
 BLOCK = 12  # rows, 0.5 s
@@ -98,8 +99,10 @@ class Scores:
             and (name, at) not in self.fitted
             and _on_worst(name, at, self.worst)
         }
-        # Delays are few, and smoothed torques know little of them.
-        unseen |= {c for c in candidates if _late(c[0])}
+        # Smoothed torques know little of delays: they wait beside what gains far more only.
+        unseen |= {
+            c for c in candidates if _late(c[0]) and not self.gains.get(c, np.inf) < LATE * best
+        }
         return [c for c in candidates if c in seen or c in unseen or c in self.pushed]
 
     def best(self) -> list[tuple[tuple[str, str | None], float]]:
