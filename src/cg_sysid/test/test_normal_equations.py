@@ -7,6 +7,7 @@ from hanging_arm import nominal, recorded
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification import identify
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import _guesses, fit
 from cg_sysid.identification.simulation_error import (
@@ -101,6 +102,28 @@ def test_model_error_counts_by_its_time_and_not_by_its_samples(model_file):
     assert dense.inflation / sparse.inflation == pytest.approx(
         4 * dense.normalised_error / sparse.normalised_error, rel=0.05
     )
+
+
+def test_only_a_round_whose_weights_nobody_knows_stops_early(model_file, monkeypatch):
+    model = Model.load(model_file)
+    data_sets = prepare(model, _short_pieces(model, 0.004))
+    minimise, drifts, horizons = identify._minimise, [], []
+
+    def told(problem, theta, motions, horizon, weight, iterations, drift, reach, **how):
+        drifts.append(drift)
+        horizons.append(horizon)
+        return minimise(problem, theta, motions, horizon, weight, iterations, drift, reach, **how)
+
+    monkeypatch.setattr(identify, '_minimise', told)
+    first = fit(model, data_sets, only=[])
+    # 0.5 s of pieces of 0.6 s are more than four fifths of their samples.
+    assert set(horizons) == {first.horizon}
+    assert (drifts[0], drifts[-1]) == (identify.LEADING, identify.DRIFT)
+    # One round alone, or weights that need not be known: at once to the minimum.
+    for how in ({'iterations': 8}, {'reweight': False}):
+        drifts.clear()
+        fit(model, data_sets, only=[], **how)
+        assert set(drifts) == {identify.DRIFT}
 
 
 def test_a_curvature_that_rounding_turned_is_solved_at_once():

@@ -468,7 +468,7 @@ def _descend(
                 'or the records are too long for an unstable motion: cut them into windows'
             )
         new = _weight(problem, found.point) if reweight else 1.0
-        # Nor under those that are about to change.
+        # Nor is it one under weights that are about to change.
         steady = bool(abs(np.log(new / weight)) < STEADY)
         idle = not thorough and found.gained < at_once * max(SMALL_GAIN, drift * found.point.cost)
         converged = steady and (found.converged or idle) and not leads
