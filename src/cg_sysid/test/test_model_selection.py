@@ -53,9 +53,10 @@ def test_a_joint_fit_is_at_least_as_good(fitted):
     for outcome in twins:
         found = fit_to_all(outcome, data_sets)
         mine = outcome.train.squares + outcome.held.squares + outcome.train.belief
-        # What it gains is what values fitted to one half lose on the other, by chance.
+        # What it gains is what values fitted to one half lose on the other, by chance; the shape
+        # of friction about rest, of which 4 s say little, loses most.
         gain = mine - found.squares - found.belief
-        assert -0.1 < gain < 5 * len(found.unknowns)
+        assert -0.1 < gain < 10 * len(found.unknowns)
 
 
 @pytest.mark.parametrize(('explained', 'compared'), [(4.9, True), (5.1, False)])

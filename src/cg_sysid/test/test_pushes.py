@@ -162,3 +162,18 @@ def test_a_push_of_a_compass_gait_is_not_compared_with_friction(model_file, monk
     event = {'impulse': (1e-6, 1e-9, 'N s'), 'instant': (1.0, 0.01, 's')}
     monkeypatch.setattr(model_selection, 'events_of', lambda o, label: {'swing': event})
     assert not model_selection.within_friction(o)
+
+
+def test_what_surely_happened_in_no_record_is_no_push(monkeypatch):
+    """A sum of little in every record may be many nats; no one of them says that it was pushed."""
+    model = arm().with_effect('external_push', 'shank').with_effect('payload', 'shank')
+    sure = {'impulse_shank_joint': (0.3, 0.01, 'N m s')}
+    for label, events, told in (
+        ('external_push@shank', {}, True),
+        ('external_push@shank', {'way': sure}, False),
+        ('payload@shank', {}, False),  # a property of the machine: no event
+        ('small faults', {}, False),
+    ):
+        o = SimpleNamespace(label=label, model=model)
+        monkeypatch.setattr(model_selection, 'events_of', lambda o, label, e=events: e)
+        assert bool(model_selection.never_happens(o)) == told, (label, events)

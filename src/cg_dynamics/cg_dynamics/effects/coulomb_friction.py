@@ -12,22 +12,17 @@ TRANSITION_RATE = Parameter(
     starts=(0.01,), scale=0.001, free=False, logarithmic=True,
     leeway=log(5.0), smoothing=True,
 )  # fmt: skip
-KNEE = Parameter(
-    'knee', '1', 'share of a law that comes to its level as x / sqrt(1 + x^2)', -1.0, 2.0,
-    neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0,
-)  # fmt: skip
-TAIL = 5 / 3  # the deviation from 1 of (2 / pi) arctan(pi x / 2) at large x is 0.4 / x
 
 
 class CoulombFriction(Effect):
     """Coulomb part of Eq. 4.12: -torque tanh(rate / transition_rate).
 
-    Others let friction turn by an arctan, which comes to its level slowly. `tails` is the share of
+    Machines and texts let friction turn in other ways, by an arctan or as a root does; and where
+    seals and bearings rub at one joint, each turns by itself. So a share may turn more slowly:
 
-        x (1 + c |x|) / (1 + c |x| + c x^2),  x = rate / transition_rate, c = 5/3       (TAILS)
+        -torque ((1 - s) tanh(v / transition_rate) + s v / sqrt(v^2 + slow_rate^2))     (SLOW)
 
-    in the law, which has the slope and the tail of an arctan. Of a robot that somebody drew less
-    is known: there `knee` is the share of x / sqrt(1 + x^2), which lies in between.
+    with v the rate and s = slow_share. An arctan of whatever width it follows to 1 % of the level.
     """
 
     name = 'coulomb_friction'
@@ -42,21 +37,18 @@ class CoulombFriction(Effect):
         ),
         TRANSITION_RATE,
         Parameter(
-            'tails', '1', 'share of a law with the slow tails of an arctan', -0.5, 1.0,
-            neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0,
+            'slow_share', '1', 'share of it that turns more slowly', 0.0, 1.0,
+            neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0, ends=('lower', 'upper'),
+        ),
+        Parameter(
+            'slow_rate', 'rad/s', 'rate over which that share turns', 1e-4, 1.0,
+            starts=(0.01,), scale=0.001, free=False, logarithmic=True, leeway=log(5.0),
         ),
     )  # fmt: skip
     largest_step = 0.002
 
-    def parameters_in(self, mechanism):
-        """With a knee in space."""
-        return self.parameters if mechanism.dimensions == 2 else (*self.parameters, KNEE)
-
     def joint_torque(self, angle, rate, load, z, p):
-        """Against the rate."""
-        x = rate / p['transition_rate']
-        slow = x * (1 + TAIL * ca.fabs(x)) / (1 + TAIL * ca.fabs(x) + TAIL * x**2)
-        quick = ca.tanh(x)
-        if 'knee' in p:
-            quick += p['knee'] * (x / ca.sqrt(1 + x**2) - quick)
-        return -p['torque'] * (quick + p['tails'] * (slow - quick)), []
+        """(SLOW), against the rate."""
+        quick = ca.tanh(rate / p['transition_rate'])
+        slow = rate / ca.sqrt(rate**2 + p['slow_rate'] ** 2)
+        return -p['torque'] * (quick + p['slow_share'] * (slow - quick)), []

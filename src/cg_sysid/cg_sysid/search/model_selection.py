@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.effects.external_push import ExternalPush
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
@@ -184,6 +185,7 @@ class ModelSelection:
             )
         if eventful and explained < settings.EVENTS.little:
             reasons += within_friction(o)
+        reasons += never_happens(o)
         own = own_parameters(o)
         # What sound robots have lies at the edge of what is a cause.
         sound = as_sound_robots(o.label, own)
@@ -207,7 +209,7 @@ class ModelSelection:
 
     def _implausible(self, o: Outcome) -> list[str]:
         """That an effect's values are none of what it is named after."""
-        effect = next((e for e in o.model.effects if e.label == o.label), None)
+        effect = _tried(o)
         if effect is None or effect.slides(o.model.mechanism):
             return []
         prefix = f'{o.label}.'
@@ -291,9 +293,25 @@ def share_explained(before: Fit, after: Fit) -> float:
     return float(np.clip(gone / max(before.normalised_error - 1, 1e-9), 0, 1))
 
 
+def never_happens(o: Outcome) -> list[str]:
+    """That what happens in single records surely happened in none of them.
+
+    A little of it in each takes the edge off whatever is wrong all the time.
+    """
+    effect = _tried(o)
+    if effect is None or all(p.each != 'record' for p in effect.parameters):
+        return []
+    return [] if events_of(o, o.label) else ['there is no record in which it surely happened']
+
+
+def _tried(o: Outcome) -> Effect | None:
+    """The effect that an outcome extends its base by."""
+    return next((e for e in o.model.effects if e.label == o.label), None)
+
+
 def within_friction(o: Outcome) -> list[str]:
     """That a push does no more at any joint than what its dry friction may be off."""
-    push = next((e for e in o.model.effects if e.label == o.label), None)
+    push = _tried(o)
     if not isinstance(push, ExternalPush):
         return []
     shared = {p.name: o.model.values[f'{o.label}.{p.name}'] for p in push.parameters if not p.each}
