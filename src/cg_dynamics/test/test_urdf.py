@@ -414,15 +414,21 @@ def test_a_tilted_base_is_as_tilted_gravity():
 
 
 def test_a_push_on_a_link_gives_momentum_to_what_carries_it():
-    """In no gravity the momenta M dq/dt become its impulses, and those of no other joint."""
+    """In no gravity the momenta M dq/dt become its impulses, and those of no other joint.
+
+    That more of it comes later shows in when they grow: the first moment of what acts is the
+    growth times the variance of the pulse over its standard deviation.
+    """
     text = random_tree(8, 4)
     body = robot(text).mechanism
     link = next(b for b in body.bodies if 1 < len(body.joints_to(b)) < 4)
     carriers = body.joints_to(link)
     impulses = {name: 1e-3 * (k + 1) * (-1) ** k for k, name in enumerate(carriers)}
+    growths = {name: 7e-4 * (k + 1) for k, name in enumerate(carriers[:-1])}
     model = robot(text).with_values({'gravity': 0.0}).with_effect(
         'external_push', link, instant=0.06, duration=0.01,
         **{f'impulse_{name}': value for name, value in impulses.items()},
+        **{f'growth_{name}': value for name, value in growths.items()},
     )  # fmt: skip
     units = {p.name: p.unit for p in model.effects[0].parameters}
     assert all(
@@ -435,10 +441,15 @@ def test_a_push_on_a_link_gives_momentum_to_what_carries_it():
     q, p = ca.SX.sym('q', 4), ca.SX.sym('p', len(body.parameters))
     named = dict(zip((x.name for x in body.parameters), ca.vertsplit(p), strict=True))
     mass = ca.Function('mass', [q, p], [body.mass_matrix(q, named)])
-    momenta = np.asarray(mass(states[-1, :4], list(nominal(body).values()))) @ states[-1, 4:8]
+    numbers = list(nominal(body).values())
+    momenta = np.array([np.asarray(mass(x[:4], numbers)) @ x[4:8] for x in states])
     expected = [impulses.get(name, 0.0) for name in body.coordinates]
     # What the motion itself changes is of second order: rates are below 0.1.
-    np.testing.assert_allclose(momenta, expected, atol=2e-5)
+    np.testing.assert_allclose(momenta[-1], expected, atol=2e-5)
+    middles = (time[1:] + time[:-1]) / 2 - 0.06
+    moments = middles @ np.diff(momenta, axis=0)
+    expected = [0.01 * growths.get(name, 0.0) for name in body.coordinates]
+    np.testing.assert_allclose(moments, expected, atol=2e-5 * 0.06)
 
 
 @pytest.mark.parametrize('name', sorted(LIBRARY))

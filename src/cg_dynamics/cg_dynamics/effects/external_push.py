@@ -26,7 +26,12 @@ class ExternalPush(StanceEffect):
 
     Where on a link of a robot somebody pushes, and which way, its joints do not tell apart. They
     tell the torque that the push has about each of them, from the link to the base, and of that
-    the impulse: one for each joint.
+    the impulse: one for each joint. While the robot moves its lever about a joint changes, to
+    first order by
+
+        torque(t) = F(t) / impulse (impulse_joint + growth_joint (t - instant) / duration)  (LEVER)
+
+    About the nearest joint that is another instant only.
     """
 
     name = 'external_push'
@@ -66,15 +71,18 @@ class ExternalPush(StanceEffect):
         if mechanism.dimensions == 2:
             return self.parameters
         impulse, *others = self.parameters
+        joints = mechanism.joints_to(self.site)[::-1]
+
+        def about(joint, name, description):
+            unit = 'N s' if mechanism.slides(joint) else 'N m s'
+            return replace(
+                impulse, name=f'{name}_{joint}', unit=unit, description=f'{description} {joint}'
+            )
+
         return (
-            *(
-                replace(
-                    impulse, name=f'impulse_{joint}',
-                    unit='N s' if mechanism.slides(joint) else 'N m s',
-                    description=f'integral of what it does to {joint}',
-                )
-                for joint in reversed(mechanism.joints_to(self.site))
-            ),
+            *(about(joint, 'impulse', 'integral of what it does to') for joint in joints),
+            *(about(joint, 'growth', 'what more of it a `duration` later does to')
+              for joint in joints[1:]),
             *others,
         )  # fmt: skip
 
@@ -96,7 +104,10 @@ class ExternalPush(StanceEffect):
         rise, fall = (ca.tanh((late + half) / edge) for half in (length / 2, -length / 2))
         pulse = (rise - fall) / (2 * length)
         if body.mechanism.dimensions == 3:
-            impulses = [p.get(f'impulse_{name}', 0.0) for name in body.mechanism.coordinates]
-            return ca.vertcat(*impulses) * pulse, []
+            about = [
+                p.get(f'impulse_{name}', 0.0) + p.get(f'growth_{name}', 0.0) * late / duration
+                for name in body.mechanism.coordinates
+            ]
+            return ca.vertcat(*about) * pulse, []
         hip, _ = body.hip()
         return ca.gradient(hip[0], body.q) * p['impulse'] * pulse, []
