@@ -302,12 +302,12 @@ def _effect(entry: EffectEntry, body: Mechanism, place: str) -> Effect:
 
 
 def _says_nothing(declared: Parameter, q: Quantity) -> bool:
-    """Whether a shape is so by default and changes nothing.
+    """Whether a shape of a law is as it always is.
 
     It stays out of files: a law that gets a shape more is still the law by whose hash bags and
-    trees know the model.
+    trees know the model. Not so the rate over which dry friction turns: simulators differ in it.
     """
-    return bool(declared.leeway) and declared.neutral is not None and q == _usual(declared)
+    return bool(declared.leeway) and not declared.smoothing and q == _usual(declared)
 
 
 def _usual(p: Parameter) -> Quantity:
