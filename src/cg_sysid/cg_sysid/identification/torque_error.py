@@ -343,8 +343,8 @@ def _descend(
         if settled:
             break
     acted = np.sqrt(np.mean(np.vstack([p.acted for p in problems]) ** 2, axis=0))
-    rms = np.sqrt(np.mean(residual**2, axis=0))
-    with np.errstate(divide='ignore', invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        rms = np.sqrt(np.mean(residual**2, axis=0))  # infinite where a start ran away
         relative = np.where(acted > 0, rms / acted, np.nan)
     values = {u.name: u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)}
     return TorqueFit(values, rms, relative, cost, scale_of(residual))
