@@ -137,6 +137,19 @@ def test_effect_parameters_left_out_take_their_defaults(robot):
     assert Model.from_text(yaml.safe_dump(tree)).values['coulomb_friction.transition_rate'] == 0.01
 
 
+def test_a_shape_as_it_always_is_stays_out_of_the_file_and_its_hash(robot):
+    """So a law may get another shape, and trees and bags still know the model."""
+    usual = {'coulomb_friction.slow_share': 0.0, 'coulomb_friction.slow_rate': 0.01}
+    assert 'slow' not in robot.text()
+    assert 'transition_rate' in robot.text()  # simulators differ in it
+    shaped = robot.with_values({'coulomb_friction.slow_share': 0.4,
+                                'coulomb_friction.slow_rate': 0.02})  # fmt: skip
+    again = Model.from_text(shaped.text())
+    assert (again.values['coulomb_friction.slow_rate'], again.hash) == (0.02, shaped.hash)
+    assert shaped.hash != robot.hash
+    assert again.with_values(usual).hash == robot.hash
+
+
 def test_changes_return_new_models(robot):
     changed = robot.with_values({'c1': 0.11})
     assert (robot.values['c1'], changed.values['c1']) == (0.1007, 0.11)
