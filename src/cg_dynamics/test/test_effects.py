@@ -159,7 +159,7 @@ def test_coulomb_friction_follows_an_arctan_to_one_per_cent(bare):
     """(2 / pi) arctan(pi w / 2 w0), whose tails are the slowest that texts draw."""
     w = np.geomspace(2e-4, 2.0, 60)
     arctan = 2 / np.pi * np.arctan(np.pi * w / 2 / 0.01)
-    found = bare.with_effect(
+    found = bare.with_effect(  # by least squares
         'coulomb_friction', torque=0.99, transition_rate=0.0746, slow_share=0.843,
         slow_rate=0.0088,
     )  # fmt: skip

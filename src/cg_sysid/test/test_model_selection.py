@@ -70,6 +70,8 @@ def test_only_a_push_that_explains_little_is_compared_with_friction(
     monkeypatch.setattr(model_selection, 'explained_by', lambda base, o: explained)
     monkeypatch.setattr(model_selection, 'within_friction', lambda o: ['no more than friction'])
     assert ('no more than friction' in selection.judge(base, event, 50.0).reason) == compared
+    monkeypatch.setattr(model_selection, 'never_happens', lambda o: ['happened nowhere'])
+    assert 'happened nowhere' in selection.judge(base, event, 50.0).reason
     # What all records share is no event.
     assert 'no more than friction' not in selection.judge(base, one, 50.0).reason
 

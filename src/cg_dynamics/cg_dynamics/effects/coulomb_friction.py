@@ -22,7 +22,8 @@ class CoulombFriction(Effect):
 
         -torque ((1 - s) tanh(v / transition_rate) + s v / sqrt(v^2 + slow_rate^2))     (SLOW)
 
-    with v the rate and s = slow_share. An arctan of whatever width it follows to 1 % of the level.
+    with v the rate and s = slow_share. Either rate may come out the smaller one: the two parts
+    differ little in shape. With its rates free the law follows an arctan to 1 % of the level.
     """
 
     name = 'coulomb_friction'
