@@ -9,7 +9,7 @@ from searches import search_for
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes, with_shapes_of_causes
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, try_candidate
+from cg_sysid.search.candidates import Task, chi2, try_candidate
 from cg_sysid.search.ranking import effect_name
 
 TRUE, OTHER = 'coulomb_friction', 'position_dependent_friction'
@@ -33,10 +33,21 @@ def search(model_file):
 
 
 def _led_by(comparison, name):
-    """The comparison with that law 25 nats ahead of all others."""
+    """The comparison with that law 25 nats ahead of all others, which leave twice the error."""
     best = 25.0 + max(c.evidence for c, _ in comparison.ranked)
+    (leader,) = (o for c, o in comparison.ranked if effect_name(c.label) == name)
+
+    def leaving_twice(o):
+        times = 2 * chi2(leader) / chi2(o)
+        return replace(
+            o, train=replace(o.train, mse=times * o.train.mse),
+            held=replace(o.held, mse=times * o.held.mse),
+        )  # fmt: skip
+
     pairs = [
-        (replace(c, reason='', evidence=best if effect_name(c.label) == name else c.evidence), o)
+        (replace(c, reason='', evidence=best), o)
+        if o is leader
+        else (replace(c, reason=''), leaving_twice(o))
         for c, o in comparison.ranked
     ]
     return replace(comparison, ranked=tuple(sorted(pairs, key=lambda pair: -pair[0].evidence)))

@@ -109,6 +109,32 @@ def _leaving(o, train, held):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ('simple', 'elaborate', 'chosen'),
+    [
+        (2.0, 1.91, 'rotor_inertia@hip'),  # It takes 9 % of what the rotor leaves above the noise.
+        (2.0, 1.89, 'joint_flexibility@hip'),
+        (1.29, 1.28, 'joint_flexibility@hip'),  # At the noise evidence decides.
+    ],
+)
+def test_what_takes_hardly_more_than_a_simpler_effect_is_not_preferred(
+    fitted, simple, elaborate, chosen
+):
+    selection, base, (one, _), _ = fitted
+    base = _leaving(base, 1e3, 1e3)
+    left = {'rotor_inertia@hip': simple, 'joint_flexibility@hip': elaborate}
+    found = [replace(_leaving(one, error, error), label=label) for label, error in left.items()]
+    comparison = selection.compare(base, found)
+    pairs = [(replace(candidate, reason=''), o) for candidate, o in comparison.ranked]
+    candidate, _ = replace(comparison, ranked=tuple(pairs), margin=0.1).winner()
+    assert candidate.label == chosen
+    # Of two that do not contain each other the better one stays.
+    away = [(replace(c, label='rotor_inertia@knee') if 'rotor' in c.label else c, o)
+            for c, o in pairs]  # fmt: skip
+    candidate, _ = replace(comparison, ranked=tuple(away), margin=0.1).winner()
+    assert candidate.label == 'joint_flexibility@hip'
+
+
 def test_nothing_can_be_earned_where_too_little_is_left(fitted):
     selection, base, _, _ = fitted
     assert selection.nothing_material(_leaving(base, 1.0, 1.85))

@@ -49,16 +49,19 @@ class Comparison:
     aside: tuple[str, ...] = ()
 
     def winner(self) -> tuple[Candidate, Outcome] | None:
-        """The best candidate that is earned, or a simpler one that it contains."""
+        """The best candidate that is earned, or a simpler one that it contains.
+
+        The simpler one if that comes within the margin, or leaves hardly more.
+        """
         able = [pair for pair in self.ranked if not pair[0].reason]
         if not able:
             return None
-        leader = able[0][0]
+        leader, best = able[0]
         simpler = [
-            pair
-            for pair in able
-            if contains(leader.label, pair[0].label)
-            and pair[0].evidence > leader.evidence - self.margin
+            (candidate, o)
+            for candidate, o in able
+            if contains(leader.label, candidate.label)
+            and (candidate.evidence > leader.evidence - self.margin or hardly_more(best, o))
         ]
         return simpler[0] if simpler else able[0]
 
@@ -358,6 +361,17 @@ def at_noise(o: Outcome) -> bool:
     return bool(
         (per_output(o.train) < settings.NOISE.at_noise).all()
         and (per_output(o.held) < settings.NOISE.at_noise).all()
+    )
+
+
+def hardly_more(o: Outcome, simpler: Outcome) -> bool:
+    """Whether an outcome leaves nearly all of what a simpler one leaves above the noise.
+
+    Where something else is wrong still, a law with more numbers takes a little of it, and hundreds
+    of nats of many samples with it. They say nothing about that law.
+    """
+    return not at_noise(simpler) and above_noise(o) > settings.DOUBT.nearly_all * above_noise(
+        simpler
     )
 
 
