@@ -7,12 +7,14 @@ import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis import comparing
+from cg_sysid.diagnosis import comparing, doubt
 from cg_sysid.diagnosis.comparing import done, less_shapes
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, try_candidate
+from cg_sysid.search.candidates import Screening, Task, try_candidate
 from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.torque_screening import Scores
 
 OWN, RIVAL = 'torque_bias', 'encoder_offset'
 
@@ -107,3 +109,92 @@ def test_a_second_law_whose_numbers_are_known_may_be_a_second_cause(search):
     ((candidate, _),) = comparison.ranked
     earned = replace(comparison, ranked=((replace(candidate, reason=''), known),))
     assert less_shapes(work, earned) is earned
+
+
+@pytest.fixture
+def raced(search):
+    """Small faults beside a base, and first looks at three effects on top of the base alone."""
+    work, base, _, _ = search
+    model, bounds = with_nuisances(base.model, work.setups())
+    lean = replace(base, model=model, task=Task(model, bounds=bounds))
+    work.comparisons[frozenset(), False] = Comparison(base, (), 100.0, 6.0)
+    work.halving.screenings.clear()
+    for effect, error in ((OWN, 4.0), (RIVAL, 399.0), ('payload', 401.0)):
+        task = Task(base.model, (effect, None))
+        work.halving.screenings[effect,] = Screening(effect, task, error)
+    yield work, lean
+    work.halving.screenings.clear()
+    work.comparisons.clear()
+
+
+def test_beside_small_faults_who_was_a_hundred_times_worse_does_not_race_again(raced):
+    work, lean = raced
+    outrun = doubt.outrun(work, lean, OWN)
+    assert [name for name, _ in outrun] == ['payload']
+    # From the point of view of the second, nobody is far behind.
+    assert not doubt.outrun(work, lean, RIVAL)
+
+
+def test_who_was_ruled_out_by_torques_does_not_race_again(raced, monkeypatch):
+    work, lean = raced
+    asked = [(OWN, None), (RIVAL, None), ('payload', None)]
+    said = Scores({('torque_constant', None): 0.0}, {effect: 100.0 for effect in asked}, ('hip',))
+    monkeypatch.setitem(work.torques, (frozenset(), False), said)
+    outrun = doubt.outrun(work, lean, OWN)
+    assert {('payload', None), ('torque_constant', None)} < set(outrun)
+    assert not {(OWN, None), (RIVAL, None)} & set(outrun)
+
+
+def test_without_a_race_before_all_race(raced):
+    work, lean = raced
+    bare = replace(lean, task=replace(lean.task, bounds={}))
+    assert not doubt.outrun(work, bare, OWN)
+    work.comparisons.clear()
+    assert not doubt.outrun(work, lean, OWN)
+
+
+def test_few_that_are_left_need_no_torques(raced, monkeypatch):
+    work, lean = raced
+    monkeypatch.setattr(comparing, 'scores', lambda *_: pytest.fail('torques were asked'))
+    every = comparing.effects_on(work, lean)
+    few = comparing.worth_a_look(work, lean, every[3:])
+    assert few == every[:3]
+
+
+def test_torques_asked_of_some_are_not_kept_for_all(raced, monkeypatch):
+    work, lean = raced
+    monkeypatch.setattr(comparing, 'scores', lambda model, train, effects, *_: None)
+    every = comparing.effects_on(work, lean)
+    assert comparing.worth_a_look(work, lean, every[:1]) == every[1:]
+    assert not work.torques
+    assert comparing.worth_a_look(work, lean) == every
+    assert list(work.torques) == [(frozenset(), True)]
+    work.torques.clear()
+
+
+def test_doubt_beside_small_faults_goes_on_from_what_is_known(raced, search, monkeypatch):
+    work, lean = raced
+    own = search[2]
+    model, bounds = with_nuisances(own.model, work.setups())
+    final = replace(own, model=model, task=Task(model, bounds=bounds))
+    monkeypatch.setitem(work.faulty, frozenset(), lean)
+    fitted, compared = [], []
+
+    def fit(tasks, what):
+        fitted.extend(tasks)
+        return [lean]
+
+    def compare(work, base, beaten, idle):
+        compared.extend(idle)
+        work.comparisons[frozenset(), True] = Comparison(base, (), 100.0, 6.0)
+
+    monkeypatch.setattr(work.halving, 'fit', fit)
+    monkeypatch.setattr(doubt, 'compare', compare)
+    doubt.without(work, lean, final, OWN)
+    ((start,),) = (task.warm_starts for task in fitted)
+    known = {u.name: v for u, v in zip(lean.train.unknowns, lean.train.values, strict=True)}
+    assert {u.name: v for u, v in zip(start.unknowns, start.values, strict=True)}.items() >= (
+        known.items()
+    )
+    assert compared == list(doubt.outrun(work, lean, OWN))
+    assert ('payload', None) in compared

@@ -21,7 +21,7 @@ from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
-from cg_sysid.search.torque_screening import scores
+from cg_sysid.search.torque_screening import KEPT, scores
 
 
 def compare(
@@ -33,7 +33,7 @@ def compare(
     if key not in work.comparisons:
         title = f'effects on top of {title_of(added)}'
         work.under_way = base
-        effects = [effect for effect in worth_a_look(work, base) if effect not in idle]
+        effects = worth_a_look(work, base, idle)
         base, task = led_deeper(work, base, effects, title)
         error = np.inf
         if beaten is not None:
@@ -76,14 +76,17 @@ def less_shapes(work: Workspace, comparison: Comparison) -> Comparison:
     return comparison
 
 
-def worth_a_look(work: Workspace, base: Outcome) -> Effects:
-    """What can be tried on top of a base, of a robot of many joints less what torques rule out."""
-    effects, key = effects_on(work, base), (work.added(base), bool(base.task.bounds))
+def worth_a_look(work: Workspace, base: Outcome, idle: Effects = ()) -> Effects:
+    """What can be tried on top of a base less what is idle, and what torques rule out."""
+    effects = [effect for effect in effects_on(work, base) if effect not in idle]
+    key = work.added(base), bool(base.task.bounds)
+    if idle and key not in work.torques and len(effects) <= KEPT:
+        return effects
+    said = work.torques.get(key)
     if key not in work.torques:
-        work.torques[key] = scores(
-            base.model, work.train, effects, base.task.bounds, work.carry_out, work.held
-        )
-    said = work.torques[key]
+        said = scores(base.model, work.train, effects, base.task.bounds, work.carry_out, work.held)
+        if not idle:
+            work.torques[key] = said
     return effects if said is None else said.worth(effects)
 
 

@@ -3,14 +3,15 @@
 import logging
 from dataclasses import replace
 
-from cg_sysid.diagnosis.comparing import compare
+from cg_sysid.diagnosis.comparing import compare, effects_on
 from cg_sysid.diagnosis.small_faults import with_law
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
-from cg_sysid.search.candidates import Outcome, Task, chi2
+from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
 from cg_sysid.search.model_selection import Comparison
 from cg_sysid.search.nuisance import with_nuisances
 from cg_sysid.search.ranking import contains
+from cg_sysid.search.successive_halving import Effects
 
 log = logging.getLogger(__name__)
 
@@ -46,13 +47,17 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
             model, missing = with_nuisances(model, work.setups())
             bounds = {**bounds, **missing}
         task = Task(model, events=final.events, bounds=bounds)
+        if bounds and others in work.faulty:
+            task = replace(
+                task, warm_starts=(started_from(work.faulty[others].train, model, bounds),)
+            )
         known = not others and not bounds
         lean = nominal if known else work.halving.fit([task], f'model without {label}')[0]
         if isinstance(lean, Failure):
             log.info('without %s: %s', label, lean)
             return None
         # Who would take the place has to come up to what is there.
-        compare(work, lean, with_law(work, final))
+        compare(work, lean, with_law(work, final), outrun(work, lean, label))
     comparison = work.comparisons[key]
     # The fit beside the others may have been better, or the only one that went through.
     ranked = comparison.of(label)
@@ -61,3 +66,18 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
         again = work.selection.compare(comparison.base, [*outcomes, replace(final, label=label)])
         comparison = work.comparisons[key] = replace(again, aside=comparison.aside)
     return comparison
+
+
+def outrun(work: Workspace, lean: Outcome, label: str) -> Effects:
+    """What the race that this cause won without small faults left far behind.
+
+    Small faults are small: they do not make up for a hundred times the error, nor for what
+    torques ruled out.
+    """
+    raced = work.added(lean), False
+    if not lean.task.bounds or raced not in work.comparisons:
+        return ()
+    behind = work.halving.far_behind(lean.task, label)
+    effects, said = effects_on(work, lean), work.torques.get(raced)
+    asked = effects if said is None else said.worth(effects)
+    return [effect for effect in effects if effect in behind or effect not in asked]

@@ -19,7 +19,8 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
     """Accept one effect after the other, until nothing more is earned."""
     work.found = o
     while len(work.added(o)) < work.options.rounds and not finished(work, o):
-        plain, o = o, with_small_faults(work, o)
+        plain = o
+        o = work.found = with_small_faults(work, plain)
         winner = None
         if not done(work, o):
             work.law = law_at_once(work, o)

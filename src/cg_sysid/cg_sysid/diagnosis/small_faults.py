@@ -54,7 +54,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
         return o
     if at_noise(o):
         return found if settled(found) else o  # only beliefs are at stake
-    found = with_hard_friction(work, found)
+    found = work.faulty[work.added(o)] = with_hard_friction(work, found)
     # Beside a large cause they would explain a little of it; then they can wait.
     return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
 

@@ -44,6 +44,7 @@ class Workspace:
         so_far: Who leads.
         comparisons: By the labels of what was added, and whether small faults are allowed for.
         torques: What torques say of candidates, by the same.
+        faulty: By the labels of what was added, the fit with small faults, taken up or not.
         thorough: Thorough fits by structure.
         joint: Fits to all records, or why there is none.
         law: What stands, with a law that sound machines follow (small_faults.sound_law).
@@ -72,6 +73,7 @@ class Workspace:
         self.so_far = SoFar(frozenset(effect.label for effect in model.effects))
         self.comparisons: dict[tuple[frozenset[str], bool], Comparison] = {}
         self.torques: dict[tuple[frozenset[str], bool], Scores | None] = {}
+        self.faulty: dict[frozenset[str], Outcome] = {}
         self.thorough: dict[Structure, Outcome] = {}
         self.joint: dict[Structure, Fit | Failure] = {}
         self.law: Outcome | None = None

@@ -107,6 +107,19 @@ class SuccessiveHalving:
                 return replace(screening, task=task)  # to torques small faults change little
         return None
 
+    def far_behind(self, base: Task, label: str) -> set[tuple[str, str | None]]:
+        """Effects that were a hundred times worse than one of them at a first look.
+
+        On the causes of this base, without small faults.
+        """
+        looks = [
+            s for s in self.screenings.values()
+            if isinstance(s, Screening) and not s.task.bounds and _causes(s.task) == _causes(base)
+        ]  # fmt: skip
+        own = next((_known(look) for look in looks if look.label == label), np.inf)
+        limit = settings.SCREENING.hopeless * max(own, 1.0)
+        return {look.task.effect for look in looks if look.task.effect and look.error > limit}
+
     def run(
         self,
         base: Task,
