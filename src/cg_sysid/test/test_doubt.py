@@ -7,7 +7,8 @@ import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis import comparing, doubt
+from cg_sysid.deadline import OutOfTime
+from cg_sysid.diagnosis import comparing, doubt, forward
 from cg_sysid.diagnosis.comparing import done, less_shapes
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.search import settings
@@ -198,3 +199,17 @@ def test_doubt_beside_small_faults_goes_on_from_what_is_known(raced, search, mon
     )
     assert compared == list(doubt.outrun(work, lean, OWN))
     assert ('payload', None) in compared
+
+
+def test_an_answer_before_the_end_has_the_small_faults_that_were_found(raced, search, monkeypatch):
+    work, lean = raced
+
+    def out_of_time(*_):
+        raise OutOfTime
+
+    monkeypatch.setattr(forward, 'with_small_faults', lambda work, o: lean)
+    monkeypatch.setattr(forward, 'finished', lambda *_: False)
+    monkeypatch.setattr(forward, 'done', out_of_time)
+    with pytest.raises(OutOfTime):
+        forward.extend(work, search[1])
+    assert work.found is lean

@@ -370,9 +370,8 @@ def hardly_more(o: Outcome, simpler: Outcome) -> bool:
     Where something else is wrong still, a law with more numbers takes a little of it, and hundreds
     of nats of many samples with it. They say nothing about that law.
     """
-    return not at_noise(simpler) and above_noise(o) > settings.DOUBT.nearly_all * above_noise(
-        simpler
-    )
+    least = settings.DOUBT.nearly_all * above_noise(simpler)
+    return not at_noise(simpler) and above_noise(o) > least
 
 
 def samples(o: Outcome) -> float:

@@ -219,7 +219,7 @@ class Doubt:
         outstanding: Share of the squared error in one record that is worth a word.
         outstanding_times: And as many times its even share.
         nearly_all: Of the squared error above the noise: a cause of another shape than its law's,
-            or a law that sound machines follow.
+            a law that sound machines follow, or who leaves so much of what a simpler one does.
         hard: Of the least rate over which friction may turn, up to which it turns as fast as that.
         as_found: Relative, within which the number that tells such a law sound stays from then on.
     """
