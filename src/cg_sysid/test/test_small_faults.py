@@ -19,7 +19,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import unknowns_of
-from cg_sysid.search import settings
+from cg_sysid.search import candidates, settings
 from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen, try_candidate
 from cg_sysid.search.model_selection import Comparison, at_noise
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
@@ -313,6 +313,26 @@ def test_what_moves_beside_one_joint_does_not_contest_small_faults_at_others():
     assert not {'stribeck_friction', 'torque_bias', 'actuator_delay'} & {name for name, _ in idle}
     # Where they leave more than noise anything may be behind them.
     assert small_faults.beside_one_joint(work, plain, plain) == []
+
+
+def test_a_fit_with_small_faults_that_goes_astray_goes_on_from_the_one_without(
+    nominal, monkeypatch
+):
+    """From the numbers of the file it may be broken off far from the data."""
+    machine = _with_small_faults(nominal)
+    train, held = (prepare(nominal, records) for records in (_records(machine)[:3],
+                                                             _records(machine)[3:]))  # fmt: skip
+    work = Workspace(nominal, train, held, Options(workers=1), lambda *_: None, None, Deadline())
+    plain = try_candidate(Task(nominal), train, held)
+    assert not at_noise(plain)
+
+    def astray(task, data_sets):
+        far = task.model.with_values({'coulomb_friction.torque': 9.0})
+        return fit(far, data_sets, only=(), bounds=task.bounds)
+
+    monkeypatch.setattr(candidates, '_own_fit', astray)
+    found = small_faults.with_small_faults(work, plain)
+    assert at_noise(found)
 
 
 def test_small_faults_stay_within_their_bounds(nominal):

@@ -42,7 +42,7 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
         return o
     model, bounds = with_nuisances(o.model, work.setups())
     title = f'{title_of(work.added(o))}, with small faults'
-    task = Task(model, events=o.events, bounds=bounds)
+    task = Task(model, events=o.events, bounds=bounds, base=o.train)
     if not at_noise(o):
         task = replace(task, reach=settings.DOUBT.most_of_it * o.train.normalised_error)
     if torque_error.can(model):
