@@ -1,6 +1,6 @@
 """Dry friction of a joint."""
 
-from math import log
+from math import log, pi
 
 import casadi as ca
 
@@ -20,10 +20,12 @@ class CoulombFriction(Effect):
     Machines and texts let friction turn in other ways, by an arctan or as a root does; and where
     seals and bearings rub at one joint, each turns by itself. So a share may turn more slowly:
 
-        -torque ((1 - s) tanh(v / transition_rate) + s v / sqrt(v^2 + slow_rate^2))     (SLOW)
+        -torque ((1 - s) tanh(v / transition_rate) + s ((1 - t) root(x) + t tail(x)))   (SLOW)
+        root(x) = x / sqrt(1 + x^2),   tail(x) = 2/pi arctan(pi x / 2),   x = v / slow_rate
 
-    with v the rate and s = slow_share. Either rate may come out the smaller one: the two parts
-    differ little in shape. With its rates free the law follows an arctan to 1 % of the level.
+    with v the rate, s = slow_share and t = slow_tails. Either rate may come out the smaller one:
+    the parts differ little in shape. An arctan has the slowest tails that texts draw, and no tanh
+    and root come nearer to it than 1 % of the level.
     """
 
     name = 'coulomb_friction'
@@ -45,11 +47,17 @@ class CoulombFriction(Effect):
             'slow_rate', 'rad/s', 'rate over which that share turns', 1e-4, 1.0,
             starts=(0.01,), scale=0.001, free=False, logarithmic=True, leeway=log(5.0),
         ),
+        Parameter(
+            'slow_tails', '1', 'its way from a root, 0, to an arctan, 1', 0.0, 1.0,
+            neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0, ends=('lower', 'upper'),
+        ),
     )  # fmt: skip
     largest_step = 0.002
 
     def joint_torque(self, angle, rate, load, z, p):
         """(SLOW), against the rate."""
         quick = ca.tanh(rate / p['transition_rate'])
-        slow = rate / ca.sqrt(rate**2 + p['slow_rate'] ** 2)
+        x = rate / p['slow_rate']
+        root, tail = x / ca.sqrt(1 + x**2), 2 / pi * ca.atan(pi / 2 * x)
+        slow = root + p['slow_tails'] * (tail - root)
         return -p['torque'] * (quick + p['slow_share'] * (slow - quick)), []

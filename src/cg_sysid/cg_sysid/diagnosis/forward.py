@@ -11,8 +11,9 @@ from cg_sysid.diagnosis.small_faults import (
 )
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome
-from cg_sysid.search.model_selection import settled
+from cg_sysid.search.model_selection import above_noise, settled
 
 
 def extend(work: Workspace, o: Outcome) -> Outcome:
@@ -20,21 +21,16 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
     work.found = o
     while len(work.added(o)) < work.options.rounds and not finished(work, o):
         plain = o
-        o = work.found = with_small_faults(work, plain)
-        winner = None
-        if not done(work, o):
-            work.law = law_at_once(work, o)
-            if work.law is not None:
-                break
-            comparison = of_size(work, compare(work, o))
-            work.law = sound_law(comparison)
-            o, winner = comparison.base, None if work.law else comparison.winner()
-            work.note(comparison, winner[0].label if winner else '')
-            if work.law is not None:
-                break
+        o, winner = raced(work, with_small_faults(work, plain))
+        waiting = work.faulty.get(work.added(plain))
+        if winner is None and waiting is not None and no_help(o, waiting):
+            # They were to wait for a cause, and none was found without them.
+            _, winner = raced(work, waiting)
+        if work.law is not None:
+            break
         if winner is not None:
-            work.found = winner[1]
-            o = work.found = refitted(work, winner[1])
+            work.found = winner
+            o = work.found = refitted(work, winner)
             continue
         if plain is o and o.task.bounds and not settled(o):
             # They came in before the causes did, and another cause could do without them.
@@ -44,3 +40,28 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
             break
         o = cause
     return o
+
+
+def raced(work: Workspace, base: Outcome) -> tuple[Outcome, Outcome | None]:
+    """The library in competition on top of a base: that base, maybe deeper, and who won.
+
+    Nobody where nothing is left to explain, or where a law that sound machines follow takes what
+    is left (Workspace.law).
+    """
+    work.found = base
+    if done(work, base):
+        return base, None
+    work.law = law_at_once(work, base)
+    if work.law is not None:
+        return base, None
+    comparison = of_size(work, compare(work, base))
+    work.law = sound_law(comparison)
+    winner = None if work.law else comparison.winner()
+    work.note(comparison, winner[0].label if winner else '')
+    return comparison.base, winner[1] if winner else None
+
+
+def no_help(o: Outcome, waiting: Outcome) -> bool:
+    """Whether a base goes without small faults that would take a part of what is left."""
+    least = settings.DOUBT.nearly_all * above_noise(o)
+    return not o.task.bounds and not settled(o) and above_noise(waiting) < least
