@@ -14,9 +14,11 @@ from cg_dynamics.effects.effect import Effect
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
-from cg_sysid.search.model_selection import Comparison, above_noise
+from cg_sysid.search.model_selection import Comparison, above_noise, at_noise
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.standings import title_of
+
+PURE = 1e-3  # share of its range that a mixture may lie off an end of it, and count as pure
 
 
 def compared_with_free_shapes(work: Workspace, comparison: Comparison) -> Comparison:
@@ -62,7 +64,7 @@ def with_free_shapes(work: Workspace, outcomes: list[Outcome], title: str) -> li
     """Each with the shapes of its law, and of dry friction at the same joint, let go."""
     tasks = [_again(o, _shapes_at(o, [o.label])) for o in outcomes]
     return [
-        with_hard_friction(work, replace(found, label=o.label))
+        with_mixed_friction(work, with_hard_friction(work, replace(found, label=o.label)))
         for o, found in zip(outcomes, work.halving.fit(tasks, title), strict=True)
         if isinstance(found, Outcome)
     ]
@@ -83,7 +85,7 @@ def with_shapes_of_causes(work: Workspace, o: Outcome) -> Outcome:
     found = work.halving.fit([task], title)[0]
     if not isinstance(found, Outcome):
         return o
-    found = with_hard_friction(work, replace(found, label=o.label))
+    found = with_mixed_friction(work, with_hard_friction(work, replace(found, label=o.label)))
     ((judged, found),) = work.selection.compare(o, [found]).ranked
     earned = judged.evidence > settings.SELECTION.earned and judged.held_gain > 0
     return found if earned else o
@@ -98,6 +100,32 @@ def _shapes_at(o: Outcome, labels: Sequence[str]) -> Bounds:
         if any(effect is law or _dry_at(effect, law.site) for law in laws)
         for p in effect.parameters if p.leeway
     }  # fmt: skip
+
+
+def with_mixed_friction(work: Workspace, o: Outcome) -> Outcome:
+    """The same from the middle of mixtures that ended pure, if that comes out better.
+
+    Where a share is none or all the numbers of what is not there show nothing: a descent that
+    gets there early stays there.
+    """
+    declared, values = o.model.declarations, o.train.values.copy()
+    for i, u in enumerate(o.train.unknowns):
+        pure = min(values[i] - u.lower, u.upper - values[i]) < PURE * (u.upper - u.lower)
+        if u.name in o.task.bounds and set(declared[u.name].ends) == {'lower', 'upper'} and pure:
+            values[i] = (u.lower + u.upper) / 2
+    if at_noise(o) or np.array_equal(values, o.train.values):
+        return o
+    title = f'{title_of(work.added(o))}, with mixed friction'
+    mixed = replace(o, train=replace(o.train, values=values))
+    task = replace(
+        _again(mixed, o.task.bounds), thorough=o.task.thorough, iterations=o.task.iterations
+    )
+    found = work.halving.fit([task], title)[0]
+    return (
+        replace(found, label=o.label)
+        if isinstance(found, Outcome) and chi2(found) < chi2(o)
+        else o
+    )
 
 
 def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted, worth_a_look
-from cg_sysid.diagnosis.free_shapes import with_hard_friction
+from cg_sysid.diagnosis.free_shapes import with_hard_friction, with_mixed_friction
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
@@ -56,7 +56,10 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
         return found if settled(found) else o  # only beliefs are at stake
     found = work.faulty[work.added(o)] = with_hard_friction(work, found)
     # Beside a large cause they would explain a little of it; then they can wait.
-    return found if chi2(found) < settings.DOUBT.most_of_it * chi2(o) else o
+    if chi2(found) >= settings.DOUBT.most_of_it * chi2(o):
+        return o
+    found = work.faulty[work.added(o)] = with_mixed_friction(work, found)
+    return found
 
 
 def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:
