@@ -13,7 +13,7 @@ from cg_sysid.diagnosis.comparing import done, less_shapes
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Screening, Task, try_candidate
-from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.model_selection import Comparison, above_noise
 from cg_sysid.search.nuisance import with_nuisances
 from cg_sysid.search.torque_screening import Scores
 
@@ -110,6 +110,50 @@ def test_a_second_law_whose_numbers_are_known_may_be_a_second_cause(search):
     ((candidate, _),) = comparison.ranked
     earned = replace(comparison, ranked=((replace(candidate, reason=''), known),))
     assert less_shapes(work, earned) is earned
+
+
+@pytest.mark.parametrize(('imitated', 'white', 'all_of_them'), [
+    (True, 0.6, False), (True, 0.4, True), (False, 0.6, True),
+])  # fmt: skip
+def test_beside_small_faults_that_imitate_all_but_white_noise_no_rotor_is_sought(
+    search, monkeypatch, imitated, white, all_of_them
+):
+    work, base, _, _ = search
+    monkeypatch.setattr(work.selection, 'imitated', lambda o: imitated)
+    monkeypatch.setattr(work.selection, 'whiteness', lambda o: white)
+    light = [('payload', None), ('stribeck_friction', None), ('presliding_friction', None)]
+    moving = [('joint_flexibility', None), ('backlash', None), ('actuator_lag', None)]
+    # How dry friction gives way before it slides is what sound machines have.
+    left = comparing.beside_imitation(work, base, [*moving, *light])
+    assert left == ([*moving, *light] if all_of_them else light)
+
+
+@pytest.mark.parametrize(('share', 'taken_up'), [(0.85, True), (0.95, False)])
+def test_small_faults_that_waited_are_taken_up_where_no_cause_was_found(
+    search, monkeypatch, share, taken_up
+):
+    work, base, own, _ = search
+    train, held = (
+        replace(fit, mse=share * fit.mse + (1 - share)) for fit in (base.train, base.held)
+    )
+    bounds = {'actuator_delay.delay': 1e-3}
+    waiting = replace(base, train=train, held=held, task=Task(base.model, bounds=bounds))
+    assert above_noise(waiting) == pytest.approx(share * above_noise(base))
+    asked = []
+
+    def raced(work, o):
+        asked.append(o)
+        return o, own if o is waiting else None
+
+    work.faulty[frozenset()] = waiting
+    monkeypatch.setattr(forward, 'with_small_faults', lambda work, o: o)
+    monkeypatch.setattr(forward, 'raced', raced)
+    monkeypatch.setattr(forward, 'refitted', lambda work, o: o)
+    monkeypatch.setattr(forward, 'rather_one_cause', lambda *_: None)
+    found = forward.extend(work, base)
+    work.faulty.clear()
+    assert found is (own if taken_up else base)
+    assert asked[:2] == ([base, waiting] if taken_up else [base])
 
 
 @pytest.fixture

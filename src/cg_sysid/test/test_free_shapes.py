@@ -7,9 +7,15 @@ import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes, with_shapes_of_causes
+from cg_sysid.diagnosis import free_shapes
+from cg_sysid.diagnosis.free_shapes import (
+    compared_with_free_shapes,
+    with_mixed_friction,
+    with_shapes_of_causes,
+)
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, chi2, try_candidate
+from cg_sysid.search.candidates import Task, chi2, started_from, try_candidate
+from cg_sysid.search.nuisance import with_nuisances
 from cg_sysid.search.ranking import effect_name
 
 TRUE, OTHER = 'coulomb_friction', 'position_dependent_friction'
@@ -131,3 +137,37 @@ def test_a_shape_that_explains_no_held_out_record_is_not_taken(search, monkeypat
     worse = replace(o, held=replace(o.held, mse=1.01 * o.held.mse))
     monkeypatch.setattr(work.halving, 'fit', lambda tasks, what: [worse])
     assert with_shapes_of_causes(work, o) is o
+
+
+def test_a_mixture_that_ended_pure_is_tried_from_its_middle(model_file, monkeypatch):
+    """Soft friction by one law, held up where all of it turns by the other and the first is hard.
+
+    Nothing says there how fast the first would turn, and a little of it so hard only hurts.
+    """
+    nominal = Model.load(model_file)
+    soft = nominal.with_values({'coulomb_friction.transition_rate': 0.05})
+    work = search_for(nominal, soft)
+    model, bounds = with_nuisances(nominal, work.setups())
+    hard = {'coulomb_friction.slow_share': 1.0, 'coulomb_friction.slow_rate': 0.02}
+    plain = try_candidate(Task(nominal), work.train, work.held)
+    start = started_from(plain.train, model, bounds)
+    values = [hard.get(u.name, v) for u, v in zip(start.unknowns, start.values, strict=True)]
+    start = replace(start, values=np.array(values))
+    pure = try_candidate(Task(model, bounds=bounds, warm_starts=(start,)), work.train, work.held)
+    ended = _values(pure)
+    assert ended['coulomb_friction.slow_share'] == pytest.approx(1.0, abs=1e-3)
+    assert ended['coulomb_friction.transition_rate'] == pytest.approx(0.01, rel=0.01)
+    mixed = with_mixed_friction(work, pure)
+    assert chi2(mixed) < chi2(pure) - 40.0  # a likelihood ratio that chance gives no three numbers
+    ended = _values(mixed)
+    assert ended['coulomb_friction.slow_share'] < 0.1
+    assert ended['coulomb_friction.transition_rate'] == pytest.approx(0.05, rel=0.1)
+    # Where no shape is free, or the noise is reached, nothing is fitted.
+    monkeypatch.setattr(work.halving, 'fit', None)
+    assert with_mixed_friction(work, plain) is plain
+    monkeypatch.setattr(free_shapes, 'at_noise', lambda o: True)
+    assert with_mixed_friction(work, pure) is pure
+
+
+def _values(o):
+    return {u.name: v for u, v in zip(o.train.unknowns, o.train.values, strict=True)}
