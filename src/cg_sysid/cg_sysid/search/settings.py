@@ -69,7 +69,7 @@ class Noise:
         quietest: Of an output of which nothing is wrong, at least.
         white: Share of independent samples from which a residual counts as white noise, [1].
         half_white: The same beside a cause or a law that sound machines follow: such laws are
-            drawn roughly.
+            drawn roughly. Beside small faults nothing with states is sought from here on.
     """
 
     at_noise: float = 1.3
