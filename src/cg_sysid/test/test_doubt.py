@@ -128,11 +128,14 @@ def test_beside_small_faults_that_imitate_all_but_white_noise_no_rotor_is_sought
     assert left == ([*moving, *light] if all_of_them else light)
 
 
-@pytest.mark.parametrize(('share', 'taken_up'), [(0.85, True), (0.95, False)])
+@pytest.mark.parametrize(
+    ('share', 'by_law', 'taken_up'),
+    [(0.85, False, True), (0.95, False, False), (0.85, True, True)],
+)
 def test_small_faults_that_waited_are_taken_up_where_no_cause_was_found(
-    search, monkeypatch, share, taken_up
+    search, monkeypatch, share, by_law, taken_up
 ):
-    work, base, own, _ = search
+    work, base, own, rival = search
     train, held = (
         replace(fit, mse=share * fit.mse + (1 - share)) for fit in (base.train, base.held)
     )
@@ -143,7 +146,8 @@ def test_small_faults_that_waited_are_taken_up_where_no_cause_was_found(
 
     def raced(work, o):
         asked.append(o)
-        return o, own if o is waiting else None
+        work.law = rival if by_law and o is waiting else None
+        return o, own if o is waiting and not by_law else None
 
     work.faulty[frozenset()] = waiting
     monkeypatch.setattr(forward, 'with_small_faults', lambda work, o: o)
@@ -152,7 +156,9 @@ def test_small_faults_that_waited_are_taken_up_where_no_cause_was_found(
     monkeypatch.setattr(forward, 'rather_one_cause', lambda *_: None)
     found = forward.extend(work, base)
     work.faulty.clear()
-    assert found is (own if taken_up else base)
+    # A law that sound machines follow stands on top of the small faults, and they with it.
+    assert found is work.found is ((waiting if by_law else own) if taken_up else base)
+    work.law = None
     assert asked[:2] == ([base, waiting] if taken_up else [base])
 
 

@@ -25,11 +25,13 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         waiting = work.faulty.get(work.added(plain))
         if winner is None and waiting is not None and no_help(o, waiting):
             # They were to wait for a cause, and none was found without them.
-            _, winner = raced(work, waiting)
+            faulty, winner = raced(work, waiting)
+            if work.law is not None:
+                o = faulty
+        work.found = winner or o
         if work.law is not None:
             break
         if winner is not None:
-            work.found = winner
             o = work.found = refitted(work, winner)
             continue
         if plain is o and o.task.bounds and not settled(o):

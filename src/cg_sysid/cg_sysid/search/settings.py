@@ -220,6 +220,7 @@ class Doubt:
         outstanding_times: And as many times its even share.
         nearly_all: Of the squared error above the noise: a cause of another shape than its law's,
             a law that sound machines follow, or who leaves so much of what a simpler one does.
+            Small faults that waited for a cause in vain have to leave less.
         hard: Of the least rate over which friction may turn, up to which it turns as fast as that.
         as_found: Relative, within which the number that tells such a law sound stays from then on.
     """
