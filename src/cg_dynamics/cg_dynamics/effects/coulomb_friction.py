@@ -24,8 +24,7 @@ class CoulombFriction(Effect):
         root(x) = x / sqrt(1 + x^2),   tail(x) = 2/pi arctan(pi x / 2),   x = v / slow_rate
 
     with v the rate, s = slow_share and t = slow_tails. Either rate may come out the smaller one:
-    the parts differ little in shape. An arctan has the slowest tails that texts draw, and no tanh
-    and root come nearer to it than 1 % of the level.
+    the parts differ little in shape. An arctan has the slowest tails that texts draw.
     """
 
     name = 'coulomb_friction'

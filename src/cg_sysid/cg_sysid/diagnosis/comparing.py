@@ -94,7 +94,7 @@ def worth_a_look(work: Workspace, base: Outcome, idle: Effects = ()) -> Effects:
 def beside_imitation(work: Workspace, base: Outcome, effects: Effects) -> Effects:
     """Less what moves by itself, where small faults come to the noise and leave half of it white.
 
-    Not even what of it they cannot imitate is there, and its fits take nine tenths of the time.
+    Not even what of it they cannot imitate is there, and its fits take most of the time.
     That a small cause may hide behind them is told.
     """
     white = work.selection.whiteness(base) > settings.NOISE.half_white

@@ -115,17 +115,8 @@ def with_mixed_friction(work: Workspace, o: Outcome) -> Outcome:
             values[i] = (u.lower + u.upper) / 2
     if at_noise(o) or np.array_equal(values, o.train.values):
         return o
-    title = f'{title_of(work.added(o))}, with mixed friction'
     mixed = replace(o, train=replace(o.train, values=values))
-    task = replace(
-        _again(mixed, o.task.bounds), thorough=o.task.thorough, iterations=o.task.iterations
-    )
-    found = work.halving.fit([task], title)[0]
-    return (
-        replace(found, label=o.label)
-        if isinstance(found, Outcome) and chi2(found) < chi2(o)
-        else o
-    )
+    return _if_better(work, o, _again(mixed, o.task.bounds), 'with mixed friction')
 
 
 def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
@@ -143,12 +134,15 @@ def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
             bounds[u.name] = float(np.log(u.prior / declared[u.name].lower))
     if bounds == o.task.bounds:
         return o
-    title = f'{title_of(work.added(o))}, with hard friction'
-    task = replace(_again(o, bounds), thorough=o.task.thorough, iterations=o.task.iterations)
-    hard = work.halving.fit([task], title)[0]
-    return (
-        replace(hard, label=o.label) if isinstance(hard, Outcome) and chi2(hard) < chi2(o) else o
-    )
+    return _if_better(work, o, _again(o, bounds), 'with hard friction')
+
+
+def _if_better(work: Workspace, o: Outcome, task: Task, how: str) -> Outcome:
+    """What a task comes to, as thorough as the outcome is, if that leaves less than it."""
+    task = replace(task, thorough=o.task.thorough, iterations=o.task.iterations)
+    found = work.halving.fit([task], f'{title_of(work.added(o))}, {how}')[0]
+    better = isinstance(found, Outcome) and chi2(found) < chi2(o)
+    return replace(found, label=o.label) if better else o
 
 
 def _again(o: Outcome, bounds: Bounds) -> Task:

@@ -58,8 +58,8 @@ def with_small_faults(work: Workspace, o: Outcome) -> Outcome:
     # Beside a large cause they would explain a little of it; then they can wait.
     if chi2(found) >= settings.DOUBT.most_of_it * chi2(o):
         return o
-    found = work.faulty[work.added(o)] = with_mixed_friction(work, found)
-    return found
+    work.faulty[work.added(o)] = with_mixed_friction(work, found)
+    return work.faulty[work.added(o)]
 
 
 def law_at_once(work: Workspace, o: Outcome) -> Outcome | None:
