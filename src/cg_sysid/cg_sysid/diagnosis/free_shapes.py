@@ -141,8 +141,9 @@ def _if_better(work: Workspace, o: Outcome, task: Task, how: str) -> Outcome:
     """What a task comes to, as thorough as the outcome is, if that leaves less than it."""
     task = replace(task, thorough=o.task.thorough, iterations=o.task.iterations)
     found = work.halving.fit([task], f'{title_of(work.added(o))}, {how}')[0]
-    better = isinstance(found, Outcome) and chi2(found) < chi2(o)
-    return replace(found, label=o.label) if better else o
+    if not isinstance(found, Outcome) or chi2(found) >= chi2(o):
+        return o
+    return replace(found, label=o.label)
 
 
 def _again(o: Outcome, bounds: Bounds) -> Task:
