@@ -17,16 +17,22 @@ from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit, predict, score
 from cg_sysid.identification.simulation_error import attempt
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, own_parameters, try_candidate
+from cg_sysid.search.candidates import (
+    Task,
+    first_seconds,
+    own_parameters,
+    screen,
+    try_candidate,
+)
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 
 
-def _record(machine, k):
+def _record(machine, k, seconds=4.0):
     return rehearse(
         f'record_{k}', machine, Setup(springs=SPRINGS), [0.1 - 0.2 * k, -0.1, 0.3, -0.5],
         [lambda t: 9.0 * math.sin(2 * math.pi * (0.5 + 0.2 * k + 0.15 * t) * t)],
-        4.0, 0.004, k,
+        seconds, 0.004, k,
     )  # fmt: skip
 
 
@@ -49,6 +55,20 @@ def test_found_from_its_grid_of_starts(model_file, effect, values):
     found = {name: value for name, (value, _, _) in own_parameters(outcome).items()}
     for name, value in values.items():
         assert found[name] == pytest.approx(value, rel=0.02)
+
+
+@pytest.mark.parametrize('step', [0.7, 2.62])  # N m, of 9: not where a fit sets out
+def test_steps_of_a_drive_are_found_beside_the_torque(model_file, step):
+    nominal = Model.load(model_file)
+    off = {'c1': 1.06 * nominal.values['c1'], 'c5': 0.92 * nominal.values['c5']}
+    machine = nominal.with_values(off).with_effect('torque_quantisation', step=step)
+    train, held = ([d] for d in prepare(nominal, [_record(machine, k, 5.0) for k in range(2)]))
+    base = Task(nominal, base=fit(nominal, train))
+    base = replace(base, first=first_seconds(base, train))
+    look = screen(replace(base, effect=('torque_quantisation', None)), train)
+    found = own_parameters(try_candidate(look.task, train, held))['step']
+    # Half a step more or less for the largest torque would be off by 4 %.
+    assert found[0] == pytest.approx(step, rel=5e-3)
 
 
 @pytest.mark.parametrize('phase', [4.4, -4.0, 0.7])

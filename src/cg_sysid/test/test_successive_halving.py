@@ -9,9 +9,10 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.errors import Failure
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import pieces, prepare
-from cg_sysid.identification.identify import fit
+from cg_sysid.identification.identify import COARSE, fit
 from cg_sysid.search import candidates, settings
 from cg_sysid.search.candidates import (
     Rival,
@@ -269,3 +270,68 @@ def test_no_rotor_is_sought_where_only_beliefs_speak(nominal):
     assert {outcome.label for outcome in outcomes} == {'torque_bias'}
     assert set(asked) == {('torque_bias', None)}
     assert set(aside) == {'joint_flexibility', 'backlash'}
+
+
+@pytest.fixture(scope='module')
+def quick(nominal):
+    """Training and held-out records, and a base with a look that leaves 60 variances."""
+    train, held = ([d] for d in _data_sets(nominal, _machine(nominal), seconds=4.5))
+    found = fit(nominal, train, iterations=2)
+    first = replace(found, mse=np.full_like(found.mse, 60.0), horizon=2.0)
+    return train, held, Task(nominal, base=first, first=first)
+
+
+@pytest.mark.parametrize(
+    ('rotor', 'ahead', 'fitted'),
+    [
+        # Share of what the best look explains: 5 of 45, then 30 of 45.
+        (55.0, 15.0, {'torque_bias', 'payload'}),
+        (30.0, 15.0, {'torque_bias', 'payload', 'backlash'}),
+        # No look explains half of the error: the first seconds say little.
+        (55.0, 40.0, {'torque_bias', 'payload', 'backlash'}),
+    ],
+)
+def test_what_takes_long_waits_where_it_is_idle_beside_the_best_look(quick, rotor, ahead, fitted):
+    train, held, base = quick
+    tried = []
+
+    def carry_out(function, arguments, what):
+        tasks = [each[0] for each in arguments]
+        if function is candidates.screen:
+            looks = {'torque_bias': ahead, 'payload': 55.0, 'backlash': rotor}
+            return [candidates.Screening(t.effect[0], t, looks[t.effect[0]]) for t in tasks]
+        if function is undisturbed:
+            return [(None, None)]
+        tried.extend(t.effect[0] for t in tasks)
+        return [Failure('not asked here') for _ in tasks]
+
+    effects = [(name, None) for name in ('torque_bias', 'payload', 'backlash')]
+    SuccessiveHalving(train, held, carry_out).run(base, effects, 'race')
+    assert set(tried) == fitted
+
+
+def test_a_look_at_a_law_without_states_goes_on_from_where_the_base_stands(quick):
+    _, _, base = quick
+    laws = {name: nominal_with(base.model, name) for name in ('torque_bias', 'backlash')}
+    starts = {
+        name: candidates._beside_base(replace(base, effect=(name, None)), model, [])
+        for name, model in laws.items()
+    }
+    assert starts['backlash'] is None  # a rotor sets out from what the file believes
+    known = dict(zip((u.name for u in base.first.unknowns), base.first.values, strict=True))
+    found = starts['torque_bias']
+    values = dict(zip((u.name for u in found.unknowns), found.values, strict=True))
+    assert values == known | {'torque_bias.bias': values['torque_bias.bias']}
+
+
+def nominal_with(model, name):
+    """A model with an effect at its first start."""
+    return next(candidates._starting_models(Task(model, (name, None))))
+
+
+def test_first_looks_take_coarse_steps(quick):
+    train, _, base = quick
+    look = candidates.screen(replace(base, effect=('torque_bias', None)), train)
+    (found, *_) = look.task.warm_starts
+    assert found.refinement == COARSE
+    assert base.first.refinement == 1.0

@@ -256,6 +256,14 @@ class Effect:
         amplitude, phase = cls.wave
         return [{'cycles': cycles, amplitude: size, phase: turn} for turn in QUARTERS]
 
+    def starts_beside(self, torque: float) -> list[dict[str, float]]:
+        """Values from which a fit sets out where its law is one of the torque; empty: as declared.
+
+        Args:
+            torque: Largest that was commanded, in N m.
+        """
+        return []
+
     def acts(self, values: Mapping[str, float]) -> bool:
         """False if the first parameter has its neutral value, so that nothing happens at all."""
         first = self.parameters[0]

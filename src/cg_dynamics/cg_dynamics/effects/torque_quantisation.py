@@ -40,6 +40,10 @@ class TorqueQuantisation(Effect):
         """Of that step."""
         return [{'step': period}]
 
+    def starts_beside(self, torque):
+        """From two steps within that torque to 20: half a step more leaves the edges elsewhere."""
+        return [{'step': 2 * torque / n} for n in range(4, 41)]
+
     def deliver(self, torque, z, p):
         """(STEPS)."""
         kept, x = 1 - p['roundness'], 2 * ca.pi * torque / p['step']

@@ -63,10 +63,11 @@ CLOSE = 1e6  # chi2/N; farther from the noise nobody needs the floor of a valley
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
+COARSE = 0.25  # the same of a first look: what needs short steps, as stiff teeth, is told later
 PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
 DAMPING = 1e-3  # of the first step
 SHORT = 0.5  # damping from which a step is short
-HOPE = 10.0  # times that gain, within which it may still come there
+HOPE = 3.0  # times that gain, within which it may still come there
 WHOLE = 'fitting whole records, in rounds until it settles'
 ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 Progress = Callable[[str, int, int, str], None]
@@ -293,7 +294,7 @@ def fit(
             that are to be as good as their intervals say.
         reach: chi2/N that matters: a fit that lies beyond and gains little is broken off.
         sure: Whether to work out how sure the values are, a tenth of the time of a short fit.
-        company: Compiled beside other effects, for first looks (company.py).
+        company: A first look: compiled beside other effects (company.py), in coarse steps.
         progress: Called with (what, done, total, how good it is so far in words).
 
     Raises:
@@ -303,7 +304,7 @@ def fit(
         raise IdentificationError('no record to identify from; at least one is needed')
     began = clock.perf_counter()
     unknowns = unknowns_of(model, only, bounds)
-    refinement = REFINED if thorough else 1.0
+    refinement = REFINED if thorough else COARSE if company else 1.0
     problem = Problem(
         model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement, company
     )
@@ -320,7 +321,7 @@ def fit(
         model, data_sets, names=[u.name for u in unknowns], theta=theta, motions=motions,
         guesses=problem.guesses, longest=longest, weight=weight, reweight=reweight,
         behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
-        thorough=thorough, reach=reach,
+        thorough=thorough, refinement=refinement, reach=reach,
     )  # fmt: skip
     end, trial = _End.of(kept_fits.recall(place)), None
     if end is None:

@@ -1,7 +1,7 @@
 """One effect on top of a model: where it can act, where its fit sets out, and how well it does."""
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -361,10 +361,12 @@ def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
     return min(best, again, key=cost)
 
 
-def started_from(found: Fit, model: Model, bounds: Bounds) -> Fit:
+def started_from(
+    found: Fit, model: Model, bounds: Bounds, only: Sequence[str] | None = None
+) -> Fit:
     """A fit as a start for a model of other effects; what it has not is where the model says."""
     known = {u.name: v for u, v in zip(found.unknowns, found.values, strict=True)}
-    unknowns = unknowns_of(model, bounds=bounds)
+    unknowns = unknowns_of(model, only, bounds)
     own = own_unknowns(model)
     before = unsettled_states(found.model)
     motions = []
@@ -460,12 +462,18 @@ def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
     From the warm starts of the task, where it has some: screenings of the same effect beside
     other small faults.
     """
-    models = list(_starting_models(task))
-    starts: list[Start] = [(model, None) for model in models]
-    if task.warm_starts:
-        starts = [(_chosen(models[0], warm_start), warm_start) for warm_start in task.warm_starts]
+    models = list(_starting_models(task, train))
     kept = _swept(models[0]) if not task.warm_starts else []
-    screenings = _all_screened(task, starts, train, kept)
+    if task.warm_starts:
+        starts: list[Start] = [
+            (_chosen(models[0], warm_start), warm_start) for warm_start in task.warm_starts
+        ]
+    else:
+        starts = [(model, _beside_base(task, model, kept)) for model in models]
+    # At a given frequency a few steps from where the base stands tell what may come of it.
+    near = bool(kept) and starts[0][1] is not None
+    iterations = settings.SCREENING.heat if near else settings.SCREENING.iterations
+    screenings = _all_screened(task, starts, train, kept, iterations)
     if kept:
         # Let go of the frequency only where a fit at its start is promising.
         screenings = _all_screened(
@@ -482,6 +490,19 @@ def _first_seconds(task: Task, train: Sequence[DataSet]) -> tuple[Fit, ...]:
         ):
             warm_starts.append(screening)
     return tuple(warm_starts[: settings.SCREENING.followed])
+
+
+def _beside_base(task: Task, model: Model, kept: Sequence[str]) -> Fit | None:
+    """Where the base stands, as a start for a look; None where the file's numbers are better.
+
+    A law without states changes little, and the base's numbers are near. A rotor takes over what
+    those have made up for, and finds no way back from them. On a robot torques lead the way.
+    """
+    tried = effect_of(task)
+    if task.first is None or tried is None or tried.states or torque_error.can(task.model):
+        return None
+    moved = [u.name for u in unknowns_of(model, bounds=task.bounds) if u.name not in kept]
+    return started_from(task.first, model, task.bounds, moved)
 
 
 def one_minimum(a: Fit, b: Fit, label: str) -> bool:
@@ -586,18 +607,24 @@ def _swept(model: Model) -> list[str]:
 
 
 def _all_screened(
-    task: Task, starts: Sequence[Start], train: Sequence[DataSet], kept: Sequence[str]
+    task: Task,
+    starts: Sequence[Start],
+    train: Sequence[DataSet],
+    kept: Sequence[str],
+    iterations: int = settings.SCREENING.iterations,
 ) -> list[tuple[Fit, Model]]:
     """Short fits from each start and where they lead, best first; `kept` stay as they are.
 
-    Of many starts all go a few steps, and the best of them the rest of the way.
+    Of many starts of what takes long, all go a few steps, the best of them the rest of the way.
     """
     moved = (u.name for u in unknowns_of(starts[0][0], bounds=task.bounds))
     only = [name for name in moved if name not in kept] if kept else None
     led = _by_torque(task, starts, train, only)
     if task.first is not None and task.first.normalised_error < settings.NOISE.at_noise:
         led = led[: 1 if led[0][1] is not None else None]  # little is left: it is not far
-    if len(led) > settings.SCREENING.followed and torque_error.can(task.model):
+    tried = effect_of(task)
+    slow = torque_error.can(task.model) or (tried is not None and bool(tried.states))
+    if len(led) > settings.SCREENING.followed and slow:
         heats = _short_fits(task, led, train, only, settings.SCREENING.heat)
         ahead = heats[: settings.SCREENING.followed]
         if ahead[0][0].normalised_error > settings.SCREENING.hopeless * task.reach:
@@ -605,7 +632,7 @@ def _all_screened(
         led = [((model, heat), None) for heat, model in ahead]
     return [
         (found, model.with_values(_numbers(found)))
-        for found, model in _short_fits(task, led, train, only, settings.SCREENING.iterations)
+        for found, model in _short_fits(task, led, train, only, iterations)
     ]
 
 
@@ -697,19 +724,25 @@ def _by_torque(
         others = ([v for n, v in found[i].values.items() if n.startswith(own)] for i in told)
         if not any(np.allclose(numbers, o, rtol=settings.SCREENING.alike) for o in others):
             told.append(k)
-    # A look at a law without states is short: torques need not choose among its starts.
-    return [led[k] for k in (told[: settings.SCREENING.followed] if tried.states else told)]
+    # A look at a law without states is short: torques need not choose among a few starts of it.
+    few = bool(tried.states) or any(p.swept for p in tried.parameters)
+    return [led[k] for k in (told[: settings.SCREENING.followed] if few else told)]
 
 
-def _starting_models(task: Task):
-    if task.effect is None:
+def _starting_models(task: Task, train: Sequence[DataSet] = ()) -> Iterator[Model]:
+    """The base with the effect, at each of its starts; some follow from the torques in `train`."""
+    tried = effect_of(task)
+    if task.effect is None or tried is None:
         yield task.model
         return
     name, at = task.effect
-    tried = LIBRARY[name](task.model.mechanism, at)
     small = any(effect.label == tried.label for effect in task.model.effects)
     base = task.model.without_effect(tried.label) if small else task.model
-    for start in starts_of(tried):
+    body = task.model.mechanism
+    drive = dict(zip(body.joints, body.inputs, strict=True)).get(tried.site)
+    torques = [float(np.abs(t.inputs_for([drive])).max()) for t in train if drive is not None]
+    starts = tried.starts_beside(max(torques)) if any(torques) else []
+    for start in starts or starts_of(tried):
         yield base.with_effect(name, at, **start | turning(base, name, at))
 
 

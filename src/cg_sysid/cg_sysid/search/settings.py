@@ -109,7 +109,7 @@ class Halving:
         belief: Times what beliefs cost the base, that a fit that is not at its end may be off.
         heavy: Cost from which a candidate is looked at when the others have been.
         first_few: Light candidates that may show that the base was in a local minimum.
-        fewest: Candidates that are fitted to whole records whatever the first look says.
+        fewest: Light candidates that are fitted to whole records whatever the first look says.
     """
 
     rungs: tuple[int, ...] = (8, 16, 36)
@@ -118,7 +118,7 @@ class Halving:
     as_good: float = 1.2
     hope: float = 10.0
     favoured: float = 2.0
-    mostly: float = 3.0
+    mostly: float = 2.0
     idle: float = 0.3
     belief: float = 3.0
     heavy: int = 10

@@ -108,7 +108,7 @@ class SuccessiveHalving:
         return None
 
     def far_behind(self, base: Task, label: str) -> set[tuple[str, str | None]]:
-        """Effects that were a hundred times worse than one of them at a first look.
+        """Effects that were out of reach of one of them at a first look.
 
         On the causes of this base, without small faults.
         """
@@ -117,7 +117,7 @@ class SuccessiveHalving:
             if isinstance(s, Screening) and not s.task.bounds and _causes(s.task) == _causes(base)
         ]  # fmt: skip
         own = next((_known(look) for look in looks if look.label == label), np.inf)
-        limit = settings.SCREENING.hopeless * max(own, 1.0)
+        limit = settings.HALVING.in_reach * max(own, 1.0)
         return {look.task.effect for look in looks if look.task.effect and look.error > limit}
 
     def run(
@@ -195,7 +195,7 @@ class SuccessiveHalving:
             )
             # Looks may mislead. But once one fit is at the noise, only others there can rival it.
             undecided = np.isinf(beaten) and best > settings.NOISE.much_wrong
-            fewest = settings.HALVING.fewest if undecided else 0
+            fewest = settings.HALVING.fewest if undecided and not of_heavy else 0
             heat = [screening for screening in _worth_more(screenings, reach, base.first, fewest)
                     if screening.label not in tried and _known(screening) <= limit
                     and _is_heavy(screening.task) == of_heavy]  # fmt: skip
