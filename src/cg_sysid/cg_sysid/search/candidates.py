@@ -725,8 +725,8 @@ def _by_torque(
         if not any(np.allclose(numbers, o, rtol=settings.SCREENING.alike) for o in others):
             told.append(k)
     # A look at a law without states is short: torques need not choose among a few starts of it.
-    few = bool(tried.states) or any(p.swept for p in tried.parameters)
-    return [led[k] for k in (told[: settings.SCREENING.followed] if few else told)]
+    many = bool(tried.states) or any(p.swept for p in tried.parameters)
+    return [led[k] for k in (told[: settings.SCREENING.followed] if many else told)]
 
 
 def _starting_models(task: Task, train: Sequence[DataSet] = ()) -> Iterator[Model]:
