@@ -329,9 +329,15 @@ def nominal_with(model, name):
     return next(candidates._starting_models(Task(model, (name, None))))
 
 
-def test_first_looks_take_coarse_steps(quick):
+def test_first_looks_in_the_plane_take_coarse_steps(quick):
     train, _, base = quick
     look = candidates.screen(replace(base, effect=('torque_bias', None)), train)
     (found, *_) = look.task.warm_starts
     assert found.refinement == COARSE
     assert base.first.refinement == 1.0
+
+
+def test_first_looks_at_a_robot_take_fine_steps():
+    robot = finger.finger()
+    found = fit(robot, finger.data(robot, 1), iterations=1, company=True)
+    assert found.refinement == 1.0  # torques lead it so near that coarse steps would lead away
