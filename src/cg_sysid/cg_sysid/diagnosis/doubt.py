@@ -71,7 +71,7 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
 def outrun(work: Workspace, lean: Outcome, label: str) -> Effects:
     """What the race that this cause won without small faults left far behind.
 
-    Small faults are small: they do not make up for a hundred times the error, nor for what
+    Small faults are small: they do not make up for ten times the error, nor for what
     torques ruled out.
     """
     raced = work.added(lean), False
