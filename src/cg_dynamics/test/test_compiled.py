@@ -198,6 +198,32 @@ def test_steps_follow_what_happens(bare, name, values):
     assert finer < 5e-8
 
 
+@pytest.mark.parametrize(
+    ('rotor', 'damping', 'goes'),
+    [
+        (0.05, 20.0, True),  # 400/s, teeth stiffer than those of real drives are
+        (1e-4, 3.0, False),  # 30 000/s: 2 ms in steps of 60 microseconds
+    ],
+)
+def test_a_coarse_simulation_does_not_follow_what_is_stiffer_than_drives(
+    bare, rotor, damping, goes
+):
+    values = {'stiffness': 2e4, 'rotor_inertia': rotor, 'damping': damping}
+    model = bare.with_effect('joint_flexibility', **values)
+    setup = Setup(fixture='inner_fixed')
+    compiled, p = compile_model(model, setup), parameter_vector(model, setup)
+    time = np.arange(0, 1, 0.002)
+    torque = 6 * np.sin(2 * np.pi * 3 * time)[:, None]
+    x0 = compiled.initial_state(np.array([0.2, 6.0]), torque[0], p)
+    measured, weight = np.zeros((len(time), compiled.ny)), np.ones(compiled.ny)
+    coarse, usual = (
+        compiled.judge(time, torque, x0, p, measured, weight, refinement=refinement)
+        for refinement in (0.25, 1.0)
+    )
+    assert usual.rows == len(time)
+    assert (coarse.rows == len(time)) == goes
+
+
 def test_sensitivities_are_stable_where_the_state_rests(bare):
     """Bristles settle within 0.3 ms; over 2 ms what is left of their turning grows eightfold."""
     model = bare.with_effect('presliding_friction', torque=0.3, deflection=0.002)

@@ -9,6 +9,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.diagnosis.by_recording import with_own
 from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.simulation_error import Problem, attempt
@@ -82,6 +83,20 @@ def test_one_compiled_model_serves_all_of_a_place():
     built = [
         compile_model(in_company(on_top(model, effect, None))[0], setup)
         for effect in ('stribeck_friction', 'torque_bias', 'asymmetric_friction')
+    ]
+    assert built[0] is built[1] is built[2]
+
+
+def test_a_size_of_each_recording_has_the_same_company():
+    model, data_sets = recorded('compass_gait_mit')
+    setup = data_sets[0].setup
+    built = [
+        compile_model(in_company(m)[0], setup)
+        for m in (
+            on_top(model, 'torque_bias', None),
+            with_own(model, 'torque_bias', None, model),
+            with_own(model, 'stribeck_friction', None, model),
+        )
     ]
     assert built[0] is built[1] is built[2]
 

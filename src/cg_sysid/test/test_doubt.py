@@ -61,6 +61,17 @@ def test_what_is_not_earned_goes_for_what_is(search):
     assert _contested(search, -50.0, 'evidence 3 nats, 10 needed').label == RIVAL
 
 
+def test_what_was_left_before_any_cause_is_known(search, monkeypatch):
+    work, base, own, _ = search
+    monkeypatch.setattr(work, 'comparisons', {})
+    monkeypatch.setattr(work.selection, 'before_causes', np.inf)
+    monkeypatch.setattr(comparing, 'done', lambda work, o: True)
+    comparing.compare(work, own)
+    assert work.selection.before_causes == np.inf
+    comparing.compare(work, base)
+    assert work.selection.before_causes == pytest.approx(above_noise(base))
+
+
 @pytest.mark.parametrize(('white', 'ends'), [(0.6, True), (0.4, False)])
 def test_beside_a_cause_half_white_is_white_enough(search, monkeypatch, white, ends):
     work, base, own, _ = search

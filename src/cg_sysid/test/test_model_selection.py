@@ -153,6 +153,44 @@ def test_what_is_earned_explains_something_of_the_records_that_it_is_fitted_to(f
     assert selection.to_be_earned(_leaving(base, 0.9, 9.0)) == pytest.approx(0.9, abs=1e-6)
 
 
+def _after_causes(fitted, monkeypatch):
+    """A jury that saw 10 000 variances before there was a cause."""
+    selection, base, _, _ = fitted
+    monkeypatch.setattr(selection, 'before_causes', np.inf)
+    selection.without_cause(_leaving(base, 2e4 + 1, 2e4 + 1))
+    selection.without_cause(_leaving(base, 1e4 + 1, 1e4 + 1))
+    return selection
+
+
+@pytest.mark.parametrize(
+    ('before', 'left', 'counts'),
+    [
+        (10.0, 4.1, False),  # it leaves 3.1 of 9
+        (10.0, 3.9, True),
+        (12.0, 11.0, True),  # more than a thousandth of what the causes explain: not their laws
+        (1.35, 1.29, True),  # what comes to the noise explains
+    ],
+)
+def test_what_takes_the_edge_off_what_causes_leave_is_none(
+    fitted, monkeypatch, before, left, counts
+):
+    selection = _after_causes(fitted, monkeypatch)
+    _, base, (one, _), _ = fitted
+    base, found = _leaving(base, before, before), _leaving(one, left, left)
+    assert ('their laws' not in selection.judge(base, found, 1e3).reason) == counts
+    # Where no cause was, there is no law that could be a little off.
+    monkeypatch.setattr(selection, 'before_causes', np.inf)
+    assert 'their laws' not in selection.judge(base, found, 1e3).reason
+
+
+def test_who_takes_the_edge_off_is_not_fitted_to_the_end(fitted, monkeypatch):
+    selection = _after_causes(fitted, monkeypatch)
+    _, base, _, _ = fitted
+    # Three tenths of the two thirds that have to be explained on records held out.
+    assert selection.to_be_earned(_leaving(base, 6.0, 9.0)) == pytest.approx(5.0)
+    assert selection.to_be_earned(_leaving(base, 12.0, 12.0)) == pytest.approx(11.9, abs=0.01)
+
+
 def _believing(o, tolerances):
     """The outcome with the first number of the file so far from what it believes, others as is."""
     values = np.array([u.prior for u in o.train.unknowns])

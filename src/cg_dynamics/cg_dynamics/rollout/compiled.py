@@ -18,7 +18,7 @@ from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiler import compiler
-from cg_dynamics.rollout.fallback import InterpretedRollout
+from cg_dynamics.rollout.fallback import HALVINGS, InterpretedRollout
 from cg_dynamics.rollout.native import NativeRollout, symbols_of
 from cg_dynamics.rollout.vector_code import UnsupportedError
 
@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 
 REFERENCE_STEP = 0.002
 TOLERANCE = 3e-7  # error of a step in units of the state scales; play multiplies it
+COARSE_HALVINGS = 3  # of a step of a coarse simulation: stiffer than real drives are no drives
 SMALLEST_STEP = 1e-4
 SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
@@ -345,7 +346,7 @@ class Judged:
         p: np.ndarray,
         measured: np.ndarray,
         weight: np.ndarray,
-        accuracy: tuple[float, float],
+        accuracy: tuple[float, float, int],
     ):
         self._compiled, self._rows, self._x0, self._p = compiled, rows, x0, p
         self._weight, self._accuracy = weight, accuracy
@@ -444,9 +445,13 @@ def simulate(
     return states, compiled.outputs(time, u, states, p)
 
 
-def _accuracy(refinement: float) -> tuple[float, float]:
-    """Longest step in s, and the error of a step from which it is halved."""
-    return REFERENCE_STEP / refinement, TOLERANCE / refinement**4
+def _accuracy(refinement: float) -> tuple[float, float, int]:
+    """Longest step in s, the error of a step from which it is halved, and how often at most.
+
+    What takes shorter steps than a coarse simulation may take runs away in it.
+    """
+    halvings = HALVINGS if refinement >= 1 else COARSE_HALVINGS
+    return REFERENCE_STEP / refinement, TOLERANCE / refinement**4, halvings
 
 
 def _array(a) -> np.ndarray:

@@ -64,10 +64,10 @@ class InterpretedRollout:
             x[:] = path[:, -1]
 
     def cgm_simulate(
-        self, n: int, dt, largest: float, tolerance: float, u, x0, p, X, most, steps
+        self, n: int, dt, largest: float, tolerance: float, halvings: int, u, x0, p, X, most, steps
     ) -> int:
         """States at all rows; the number of rows before the state ran away."""
-        path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, None)
+        path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, halvings, None)
         X[:] = path[row]
         return _sane_rows(X)
 
@@ -81,19 +81,19 @@ class InterpretedRollout:
             at, late = _interpolate(time, time - delay[j], X, *ends)
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
-    def cgm_follow(self, n, time, largest, tolerance, u, x0, p, delay) -> Simulated:
+    def cgm_follow(self, n, time, largest, tolerance, halvings, u, x0, p, delay) -> Simulated:
         """The states and outputs of a record, up to where the state runs away."""
         states = np.empty((n, self.nx))
         done = self.cgm_simulate(
-            n, np.diff(time), largest, tolerance, u, x0, p, states, 0, None
+            n, np.diff(time), largest, tolerance, halvings, u, x0, p, states, 0, None
         )  # fmt: skip
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time[:done], u[:done], p, states[:done], delay, y)
         return Simulated(y, states, np.zeros((n, 0), np.int32))
 
     def cgm_normal(
-        self, simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
-        measured, weight, delay, delay_to, H, g, Jacobian,
+        self, simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p, nc,
+        column, measured, weight, delay, delay_to, H, g, Jacobian,
     ) -> None:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
         nx, ny = self.nx, self.ny
@@ -106,7 +106,9 @@ class InterpretedRollout:
         if delay_column >= 0:
             chain[-1, delay_column] += 1
         start = np.concatenate([x0, np.eye(nx, width).ravel(order='F')])
-        _, row, steps = self._paced(np.diff(time), u, p, x0, largest, tolerance, self._decay)
+        _, row, steps = self._paced(
+            np.diff(time), u, p, x0, largest, tolerance, halvings, self._decay
+        )
         held = np.repeat(np.hstack([u, du])[:-1], np.diff(row), axis=0).T
         path = self._chain(self._sensitive_step, start, held, p, steps)
         rows = np.hstack([start[:, None], path])[:, row].T
@@ -196,7 +198,7 @@ class InterpretedRollout:
         e = self.equations
         return ca.Function('decay', [e.x, e.u, e.p], [-ca.trace(ca.jacobian(e.rates, e.x))])
 
-    def _paced(self, dt, u, p, x0, largest, tolerance, decay):
+    def _paced(self, dt, u, p, x0, largest, tolerance, halvings, decay):
         """Steps halved where they err or, with `decay`, are not stable: `follow` in rollout.c.
 
         Returns:
@@ -216,7 +218,7 @@ class InterpretedRollout:
                         continue
                     y, error = self._probe(x, held, p, h)
                     error = float(error) / tolerance
-                    if error > 1 and halved < HALVINGS:
+                    if error > 1 and halved < halvings:
                         halved += 1
                         continue
                     done += size

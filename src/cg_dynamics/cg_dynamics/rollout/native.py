@@ -60,7 +60,7 @@ class NativeRollout:
     def _interpreted(self) -> InterpretedRollout:
         return InterpretedRollout(self.equations, self.free)
 
-    def cgm_follow(self, n, time, largest, tolerance, u, x0, p, delay) -> Simulated:
+    def cgm_follow(self, n, time, largest, tolerance, halvings, u, x0, p, delay) -> Simulated:
         """The states and outputs of a record, up to where the state runs away.
 
         Args:
@@ -68,6 +68,7 @@ class NativeRollout:
             time: Their stamps in s, shape (n,).
             largest: Longest integration step in s.
             tolerance: Error of a step, in units of the states' scales, from which it is halved.
+            halvings: Times that it is, at most.
             u: Inputs, each held until the next row, shape (n, nu).
             x0: State at the first row, shape (nx,).
             p: Parameter vector.
@@ -77,14 +78,16 @@ class NativeRollout:
         rows = np.diff(time)
         most = max(1, int(np.ceil(rows.max(initial=0.0) / largest)))
         steps = np.zeros((n, most), np.int32)
-        done = self.cgm_simulate(n, rows, largest, tolerance, u, x0, p, states, most, steps)
+        done = self.cgm_simulate(
+            n, rows, largest, tolerance, halvings, u, x0, p, states, most, steps
+        )
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time, u, p, states, delay, y)
         return Simulated(y, states, steps)
 
     def cgm_normal(
-        self, simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
-        measured, weight, delay, delay_to, H, g, Jacobian,
+        self, simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p, nc,
+        column, measured, weight, delay, delay_to, H, g, Jacobian,
     ) -> None:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13) of a record that was followed.
 
@@ -96,6 +99,7 @@ class NativeRollout:
             time: Their stamps in s, shape (n,).
             largest: Longest integration step in s.
             tolerance: As of cgm_follow.
+            halvings: As of cgm_follow.
             u: Inputs, each held until the next row, shape (n, nu).
             du: Their derivative by their delay, shape (n, nu).
             delay_column: Column of that delay, or -1.
@@ -120,8 +124,8 @@ class NativeRollout:
             kernel = self._windows
         except UnsupportedError:
             self._interpreted.cgm_normal(
-                simulated, n, time, largest, tolerance, u, du, delay_column, x0, S0, p, nc, column,
-                measured, weight, delay, delay_to, H, g, Jacobian,
+                simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p,
+                nc, column, measured, weight, delay, delay_to, H, g, Jacobian,
             )  # fmt: skip
             return
         active = np.flatnonzero(column >= 0)
@@ -369,7 +373,7 @@ def _bind(library: Path) -> ctypes.CDLL:
     loaded.cgm_advance.argtypes = [_ARRAY, _ARRAY, _ARRAY, _NUMBER, _COUNT]
     loaded.cgm_advance.restype = None
     loaded.cgm_simulate.argtypes = [
-        _COUNT, _ARRAY, _NUMBER, _NUMBER, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _COUNT,
+        _COUNT, _ARRAY, _NUMBER, _NUMBER, _COUNT, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _COUNT,
         _optional(_WHOLE),
     ]  # fmt: skip
     loaded.cgm_outputs.argtypes = [_COUNT, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY, _ARRAY]

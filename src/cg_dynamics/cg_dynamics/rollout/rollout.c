@@ -91,6 +91,7 @@ static double error_of(const vd *x, const vd *y, const vd *k4, const vd *u, cons
 /* How far a row's interval is cut: steps are halved where they err, as where teeth meet or
    friction turns, and doubled where they are easy. */
 typedef struct {
+    const int halvings; /* at most */
     int halved; /* times, from row to row */
     int done;   /* smallest steps of this interval */
     unsigned steps; /* a bit for each smallest step at which one of this interval began */
@@ -102,7 +103,7 @@ static const int WHOLE = 1 << HALVINGS;
 static int stands(Pace *pace, double error)
 {
     const int length = WHOLE >> pace->halved;
-    if (error > 1 && pace->halved < HALVINGS) {
+    if (error > 1 && pace->halved < pace->halvings) {
         pace->halved++;
         return 0;
     }
@@ -125,12 +126,13 @@ static void follow(vd *x, const vd *u, const vd *s, double h, double tolerance, 
 }
 
 /* States at all rows, X (n, NX), and the steps that led there (Pace), steps (n, most) if not null,
-   where no row takes more than `most` intervals. Returns the number of rows before the state ran
-   away. */
-int cgm_simulate(int n, const double *dt, double largest, double tolerance, const double *inputs,
-                 const double *x0, const double *p, double *X, int most, int *steps)
+   where no row takes more than `most` intervals, cut in half at most `halvings` times. Returns the
+   number of rows before the state ran away. */
+int cgm_simulate(int n, const double *dt, double largest, double tolerance, int halvings,
+                 const double *inputs, const double *x0, const double *p, double *X, int most,
+                 int *steps)
 {
-    Pace pace = {0};
+    Pace pace = {.halvings = halvings};
     vd s[SHARED + 1], x[NX], u[NU];
     prepared(p, s);
     splat(NX, x0, x);

@@ -52,19 +52,19 @@ def what_wanders(
         return None
     start = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     numbers = list(numbers_of(o.train.model, data_sets, names))
-    nothing = (o, '', None, data_sets, start, np.inf, ITERATIONS)
+    nothing = (o, '', None, data_sets, start, np.inf, False)
     base = run(_fit_with_own, [nothing], 'all recordings as one')[0]
     if isinstance(base, Failure) or base.normalised_error < settings.NOISE.at_noise:
         return None
     # Who leaves more is neither named nor in the way of another.
     reach = 1 + (1 - EXPLAINS) / CLEARLY * (base.normalised_error - 1)
-    arguments = [(o, *number, data_sets, start, reach, FIRST_ITERATIONS) for number in numbers]
+    arguments = [(o, *number, data_sets, start, reach, True) for number in numbers]
     first = run(_fit_with_own, arguments, 'recording by recording')
     leading = sorted(
         ((f, number) for f, number in zip(first, numbers, strict=True) if isinstance(f, Fit)),
         key=lambda pair: _above_noise(pair[0]),
     )[:FINALISTS]
-    arguments = [(o, *number, data_sets, f, reach, ITERATIONS) for f, number in leading]
+    arguments = [(o, *number, data_sets, f, reach, False) for f, number in leading]
     found = run(_fit_with_own, arguments, 'the best of them to their end')
     fits = sorted((f for f in found if isinstance(f, Fit)), key=_above_noise)
     if not fits:
@@ -122,9 +122,12 @@ def _fit_with_own(
     data_sets: Sequence[DataSet],
     start: Fit,
     reach: float,
-    iterations: int,
+    first: bool,
 ) -> Fit | Failure:
-    """A fit to all records where every recording has its own size of the effect that is named."""
+    """A fit to all records where every recording has its own size of the effect that is named.
+
+    At first a few iterations in company: to compile dozens of models takes three times as long.
+    """
     model = with_own(o.model, name, at, o.train.model) if name else o.model
     bounds = o.task.bounds
     try:
@@ -134,8 +137,10 @@ def _fit_with_own(
             start=started_from(start, model, bounds),
             own=o.events,
             bounds=bounds,
-            iterations=iterations,
+            iterations=FIRST_ITERATIONS if first else ITERATIONS,
             reach=reach,
+            sure=not first,
+            company=first,
         )
         return replace(found, model=o.model)  # a class made here does not leave this process
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:

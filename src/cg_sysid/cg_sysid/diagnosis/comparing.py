@@ -36,6 +36,8 @@ def compare(
         work.under_way = base
         effects = beside_imitation(work, base, worth_a_look(work, base, idle))
         base, task = led_deeper(work, base, effects, title)
+        if not added:
+            work.selection.without_cause(base)
         error = np.inf
         if beaten is not None:
             error, task = beaten.train.normalised_error, replace(task, rival=rival_of(beaten))

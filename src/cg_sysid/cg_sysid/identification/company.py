@@ -29,7 +29,8 @@ def in_company(model: Model) -> tuple[Model, Model]:
     if not model.effects or model.mechanism.dimensions != 2:
         return model, model
     *base, last = model.effects
-    if not _goes_along(last):
+    # As the library has it: whether its size is one for all recordings changes no equation.
+    if last.name not in LIBRARY or not _goes_along(LIBRARY[last.name](model.mechanism, last.at)):
         return model, model
     (places,) = (places for places in PLACES if last.place in places)
     present = {effect.label for effect in base}
@@ -58,8 +59,7 @@ def _library_of(model: Model, places: tuple[str, ...]) -> list[Effect]:
 def _goes_along(effect: Effect) -> bool:
     """Whether it can be at rest without a trace: no states, inputs or steps of its own."""
     return (
-        effect.name in LIBRARY
-        and any(effect.place in places for places in PLACES)
+        any(effect.place in places for places in PLACES)
         and not effect.states
         and not effect.extra_inputs
         and effect.largest_step >= REFERENCE_STEP

@@ -92,7 +92,15 @@ class Comparison:
 
 
 class ModelSelection:
-    """Judges outcomes that were fitted on one split of records."""
+    """Judges outcomes that were fitted on one split of records.
+
+    Args:
+        train: Data sets to fit.
+        held: Data sets held out.
+
+    Attributes:
+        before_causes: chi2/N above the noise before there was any cause (`without_cause`).
+    """
 
     def __init__(self, train: Sequence[DataSet], held: Sequence[DataSet]):
         data_sets = (*train, *held)
@@ -105,6 +113,11 @@ class ModelSelection:
             max(judged / settings.SELECTION.fewest_blocks, settings.SELECTION.shortest_block_s),
         )
         self.rows_per_block = max(1, int(block / np.median(self.steps)))
+        self.before_causes = np.inf
+
+    def without_cause(self, base: Outcome) -> None:
+        """Take note of what a base without any cause leaves: the least of them counts."""
+        self.before_causes = min(self.before_causes, above_noise(base))
 
     def compare(
         self, base: Outcome, outcomes: Sequence[Outcome], to_all: Sequence[Fit | Failure] = ()
@@ -186,6 +199,13 @@ class ModelSelection:
                 f'leaves {100 * left:.0f} % of the error, at most '
                 f'{100 * settings.SELECTION.mishap:.0f} % allowed'
             )
+        elif self._is_remainder(base) and not at_noise(o) and left > settings.SELECTION.mishap:
+            # A law that is drawn otherwise leaves a little, and much takes the edge off that.
+            share = 100 * float(np.sqrt(above_noise(base) / self.before_causes))
+            reasons.append(
+                f'leaves {100 * left:.0f} % of an error that is {share:.1g} % of what the causes '
+                'before it explain: their laws may be so far off'
+            )
         if eventful and explained < settings.EVENTS.little:
             reasons += within_friction(o)
         reasons += never_happens(o)
@@ -263,9 +283,16 @@ class ModelSelection:
         if prior_conflicts(base) or self.imitated(base):
             return np.inf
         count = base.train.count.sum(axis=0)
-        least = settings.SELECTION.material**2 * float(count.min() / count.sum())
         error = base.train.normalised_error
-        return error - settings.SELECTION.half_seen * min(least, max(error - 1.0, 0.0))
+        above = max(error - 1.0, 0.0)
+        least = min(settings.SELECTION.material**2 * float(count.min() / count.sum()), above)
+        if self._is_remainder(base):
+            least = max(least, (1 - settings.SELECTION.mishap) * above)
+        return error - settings.SELECTION.half_seen * least
+
+    def _is_remainder(self, base: Outcome) -> bool:
+        """Whether the laws of the causes, were they a little off, would leave as much."""
+        return above_noise(base) < settings.SELECTION.remainder * self.before_causes < np.inf
 
     def whiteness(self, o: Outcome) -> float:
         """Share of independent samples in what is left; 1 of white noise."""

@@ -146,6 +146,8 @@ class Selection:
         shortest_block_s: But not below this, in s.
         accounts: Of the squared error above the noise: who takes less does not explain it.
         mishap: Of the error above the noise: what events of single records leave at most.
+        remainder: Of the squared error that causes explain: up to here what they leave may be the
+            shape of their laws, 3 % off. Who explains that leaves no more of it than `mishap`.
         says_more: Independent samples of a record for each value that it has of its own.
         too_small: Standard deviations within which an effect's size may be none at all.
     """
@@ -164,6 +166,7 @@ class Selection:
     shortest_block_s: float = 0.1
     accounts: float = 0.5
     mishap: float = 1 / 3
+    remainder: float = 1e-3
     says_more: float = 4.0
     too_small: float = 2.0
 
