@@ -123,6 +123,11 @@ def test_effect_at_its_default_changes_something(bare, springs, name, site):
         ),
         ('quadratic_friction', {'coefficient': 0.3}, lambda w: -0.3 * w * abs(w)),
         (
+            'quadratic_friction',
+            {'coefficient': 0.3, 'cubic_share': 0.4},
+            lambda w: -0.18 * w * abs(w) - 0.12 * w**3,
+        ),
+        (
             'stribeck_friction',
             {'torque': 1.2, 'stribeck_rate': 0.8},
             lambda w: -1.2 * np.exp(-((w / 0.8) ** 2)) * np.tanh(w / 0.01),

@@ -8,8 +8,8 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_dynamics.rollout.compiled import compile_model
-from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.diagnosis.by_recording import with_own
+from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.company import in_company
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.simulation_error import Problem, attempt

@@ -406,3 +406,23 @@ def test_a_small_delay_is_no_cause_where_only_beliefs_speak_for_it(nominal, late
 )
 def test_no_cause_is_as_small_as_a_small_fault(label, sizes, small):
     assert bool(as_sound_robots(label, sizes)) == small
+
+
+def test_behind_steps_of_a_drive_a_small_delay_is_one_of_the_readings(model_file):
+    """What acts before a staircase has no slope by its delay: a fit does not find it."""
+    nominal = Model.load(model_file)
+    stepped = nominal.with_effect('torque_quantisation', step=1.17)
+    machine = stepped.with_effect('sensor_delay', delay=1e-3)
+    data_sets = prepare(nominal, _records_on(machine, _springs(200.0)))
+    model, bounds = with_nuisances(stepped, [data_sets[0].setup])
+    assert 'sensor_delay.delay' in bounds
+    assert not any(name.startswith(('actuator_delay', 'sensor_delay@')) for name in bounds)
+    found = fit(model, data_sets, bounds=bounds)
+    late = dict(zip((u.name for u in found.unknowns), found.values, strict=True))
+    assert late['sensor_delay.delay'] == pytest.approx(1e-3, abs=1e-4)
+    assert found.normalised_error < 1.1
+
+    before = stepped.with_effect('actuator_delay', delay=1e-6)
+    names = {'torque_quantisation.roundness', 'actuator_delay.delay'}
+    bounds = {n: b for n, b in bounds.items() if n in names} | {'actuator_delay.delay': 1.2e-3}
+    assert fit(before, data_sets, bounds=bounds).normalised_error > 2

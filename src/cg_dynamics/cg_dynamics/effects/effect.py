@@ -134,6 +134,7 @@ class Effect:
             their functions; empty where it is more than a function of one variable.
         ripple: True where its slope changes sign within small motions, so that the slope at one
             state tells nothing of those around it.
+        steps: True where it answers in steps, so that what acts before it has next to no slope.
         at: Joint, body or sensor where this instance acts; None where there is only one.
         start_torque: START_TORQUE at a joint of this size, N m (N where it slides).
     """
@@ -151,6 +152,7 @@ class Effect:
     friction: ClassVar[str] = ''
     family: ClassVar[tuple[str, ...]] = ()
     ripple: ClassVar[bool] = False
+    steps: ClassVar[bool] = False
 
     def __init__(self, mechanism: Mechanism, at: str | None = None):
         sites = self.sites(mechanism)

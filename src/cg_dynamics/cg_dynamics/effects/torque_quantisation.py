@@ -20,6 +20,7 @@ class TorqueQuantisation(Effect):
     place = 'command'
     family = ('joint_torque', 'torque')
     ripple = True
+    steps = True
     summary = (
         'The drive rounds its command: tau_motor = step round(tau/step), with edges that are '
         'round if they have roundness.'

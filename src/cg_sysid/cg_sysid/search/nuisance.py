@@ -28,7 +28,8 @@ SOUND = {
 # way a little before it slides.
 SOUND_LAWS = {'presliding_friction': ('deflection', 2.5e-3)}
 # Other names of the same fault: in what is recorded, a late reading is a late torque.
-ALSO = {'sensor_delay': 'actuator_delay'}
+LATE_READING = 'sensor_delay'
+ALSO = {LATE_READING: 'actuator_delay'}
 NEXT_TO_NOTHING = 1e-3  # of the largest size: at its neutral value an effect takes no part
 
 Bounds = Mapping[str, float]
@@ -47,11 +48,14 @@ def with_nuisances(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bounds
         for declared in effect.parameters:
             if declared.leeway:
                 bounds[f'{effect.label}.{declared.name}'] = declared.leeway
-    for name, (parameter, largest) in SOUND.items():
+    # What is late before steps has no slope by its delay, and no fit finds it.
+    late = LATE_READING if any(effect.steps for effect in model.effects) else ALSO[LATE_READING]
+    for fault, (parameter, largest) in SOUND.items():
+        name = late if fault == ALSO[LATE_READING] else fault
         kind = LIBRARY[name]
         if not kind.applies(setups):
             continue
-        for site in kind.sites(model.mechanism):
+        for site in ('all',) if name == late else kind.sites(model.mechanism):
             label = kind(model.mechanism, site).label
             if label not in present:
                 model = model.with_effect(name, site, **{parameter: NEXT_TO_NOTHING * largest})
