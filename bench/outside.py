@@ -32,13 +32,16 @@ import argparse
 import hashlib
 import json
 import math
+import multiprocessing
 import os
 import resource
 import sys
+import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +68,7 @@ from cg_bringup.hidden import draw_values, hidden_effects_file
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
+from cg_sysid import parallel
 from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
@@ -274,18 +278,22 @@ def cpu_seconds() -> float:
     return sum(u.ru_utime + u.ru_stime for u in whole)
 
 
-def run(case: Case, version: str, limit: float) -> dict[str, Any]:
+def run(case: Case, version: str, limit: float, cores: int = 1) -> dict[str, Any]:
     """One line of the raw results."""
     about = {'case': case.name, 'group': case.group, 'version': version, 'laws': case.laws,
              'friction': case.friction, 'faults': case.faults}  # fmt: skip
     nominal, records, values = records_of(case)
-    cpu = cpu_seconds()
+    cpu, wall = cpu_seconds(), time.monotonic()
     try:
-        found = diagnose(nominal, records, Options(workers=1), deadline=Deadline(limit))
+        found = diagnose(nominal, records, Options(workers=cores), deadline=Deadline(limit))
     except Exception:  # whatever a diagnosis dies of is a wrong answer, and not the bench's end
         return about | {'verdict': 'failed', 'why': traceback.format_exc(limit=-3), 'causes': [],
-                        'rivals': [], 'inside': [], 'values': values,
+                        'rivals': [], 'inside': [], 'values': values, 'cores': cores,
                         'cpu_s': round(cpu_seconds() - cpu, 1)}  # fmt: skip
+    wall = time.monotonic() - wall
+    parallel.stop()
+    for worker in multiprocessing.active_children():
+        worker.join()  # what it spent counts from then on
     described = found.unmodelled.explained if found.unmodelled else 0.0
     return about | {
         'values': values,
@@ -305,7 +313,9 @@ def run(case: Case, version: str, limit: float) -> dict[str, Any]:
             for off, sigma in errors_of(_told(c), values[law])
         ],
         'summary': found.summary,
+        'cores': cores,
         'cpu_s': round(cpu_seconds() - cpu, 1),
+        'wall_s': round(wall, 1),
     }  # fmt: skip
 
 
@@ -352,21 +362,23 @@ def wilson(right: int, count: int) -> tuple[float, float]:
 
 def table_of(rows: list[dict[str, Any]]) -> list[str]:
     """By group of cases."""
+    took, unit = _time_of(rows)
     lines = [
         '| machines | cases | right | 95 % interval | truth among rivals too '
-        '| CPU s: median | 95 % | longest |',
+        f'| {unit}: median | 95 % | longest |',
         '|---|---:|---:|---:|---:|---:|---:|---:|',
     ]
     groups = sorted({row['group'] for row in rows}, key=_order)
     for title, own in [(g, [r for r in rows if r['group'] == g]) for g in groups]:
         right = sum(map(is_right, own))
         low, high = wilson(right, len(own))
-        cpu = [row['cpu_s'] for row in own if 'cpu_s' in row] or [math.nan]
+        seconds = [row[took] for row in own if took in row] or [math.nan]
         hidden = any(law in LAWS for row in own for law in row['laws'])
         among = f'{sum(map(is_among, own))}' if hidden else ''
         lines.append(
             f'| {title} | {len(own)} | {right} | {low:.0%} to {high:.0%} | {among} '
-            f'| {np.median(cpu):.0f} | {np.quantile(cpu, 0.95):.0f} | {max(cpu):.0f} |'
+            f'| {np.median(seconds):.0f} | {np.quantile(seconds, 0.95):.0f} '
+            f'| {max(seconds):.0f} |'
         )
     inside = [x for row in rows if is_right(row) for x in row['inside']]
     cpu = [row['cpu_s'] for row in rows if 'cpu_s' in row]
@@ -386,13 +398,27 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
     if described:
         shares = ', '.join(f'{share:.0%}' for share in described)
         lines += ['', f'Share of the error that a learned term takes, unlisted: {shares}.']
+    all_of_them = f'All {len(rows)} cases:'
+    if took == 'wall_s':
+        wall = [row[took] for row in rows if took in row]
+        all_of_them += (
+            f' {unit.removeprefix("s ")} median {np.median(wall):.0f} s, 95 % '
+            f'{np.quantile(wall, 0.95):.0f} s, longest {max(wall):.0f} s;'
+        )
     lines += [
         '',
-        f'All {len(rows)} cases: CPU time median {np.median(cpu):.0f} s, 95 % '
-        f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, compilation included; '
+        f'{all_of_them} CPU time median {np.median(cpu):.0f} s, 95 % '
+        f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, with the compilation of '
+        'models that no case before had; '
         f'{sum(row["verdict"] == "unfinished" for row in rows)} without an end.',
     ]
     return lines
+
+
+def _time_of(rows: list[dict[str, Any]]) -> tuple[str, str]:
+    """What is told of the time that cases took, and its unit in words."""
+    cores = {row.get('cores', 1) for row in rows}
+    return ('cpu_s', 'CPU s') if cores == {1} else ('wall_s', f's on {max(cores)} cores')
 
 
 def _order(group: str) -> int:
@@ -446,35 +472,40 @@ def version_of_sources() -> str:
 def told(row: dict[str, Any]) -> str:
     """A row for the screen."""
     words = row['case'], *row['laws'], '->', row['verdict'], *row['causes']
-    return ' '.join([*words, '' if is_right(row) else 'WRONG', str(row.get('cpu_s', ''))])
+    took = (str(row[name]) for name in ('cpu_s', 'wall_s') if name in row)
+    return ' '.join([*words, '' if is_right(row) else 'WRONG', *took])
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--case', help='KIND:NUMBER, run and told in words')
     parser.add_argument('--sample', type=int, help='so many of all cases')
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='cases side by side')
+    parser.add_argument(
+        '--cores', type=int, default=os.cpu_count() or 1,
+        help='of a case, as many cases side by side as there are cores for [all]',
+    )  # fmt: skip
     parser.add_argument('--limit', type=float, default=LIMIT, help=f's a case [{LIMIT:g}]')
     parser.add_argument('--raw', type=Path, default=ROOT / 'build' / 'outside.jsonl')
     parser.add_argument('--write', type=Path)
     parser.add_argument('--table-only', action='store_true', help='of the last version in --raw')
     options = parser.parse_args()
-    version, cases = version_of_sources(), programme()
+    version, cases = f'{version_of_sources()}-{options.cores}', programme()
     if options.case:
         wanted = [case for case in cases if case.name == options.case]
         if not wanted:
             there = ', '.join(f'{kind}:0 to {n - 1}' for kind, n in KINDS.items())
             print(f'no case {options.case}; there are {there}', file=sys.stderr)
             return 2
-        row = run(wanted[0], version, options.limit)
+        row = run(wanted[0], version, options.limit, options.cores)
         print(json.dumps(row, indent=1), 'right' if is_right(row) else 'wrong', sep='\n')
         return 0
     chosen = sampled(cases, options.sample) if options.sample else cases
     rows = known_rows(options.raw, None if options.table_only else version)
     if not options.table_only:
         rows = with_missing(
-            rows, chosen, run, version, options.raw, options.workers, options.limit, told
-        )
+            rows, chosen, partial(run, cores=options.cores), version, options.raw,
+            max(1, (os.cpu_count() or 1) // options.cores), options.limit, told,
+        )  # fmt: skip
     made = [rows[case.name] for case in chosen if case.name in rows]
     if not made:
         print('no rows of these sources', file=sys.stderr)
@@ -488,8 +519,9 @@ def main() -> int:
         sample = f' --sample {options.sample}' if options.sample else ''
         options.write.write_text('\n'.join([
             '# Machines that share no code with the models', '',
-            f'Command: `./cg exec python bench/outside.py{sample}`; this table of its rows: the '
-            f'same with `--table-only --write FILE`. Sources {made[0]["version"]}.',
+            f'Command: `./cg exec python bench/outside.py{sample} --cores '
+            f'{made[0].get("cores", 1)}`; this table of its rows: the same with '
+            f'`--table-only --write FILE`. Sources {made[0]["version"]}.',
             f'The programme: {what}{drawn}. What is right is written at the head of the bench, '
             'and was settled before any case was run.', '', *lines, '',
         ]))  # fmt: skip

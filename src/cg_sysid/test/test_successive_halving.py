@@ -311,6 +311,28 @@ def test_what_takes_long_waits_where_it_is_idle_beside_the_best_look(quick, roto
     assert set(tried) == fitted
 
 
+@pytest.mark.parametrize(('left', 'deeper'), [(42.0, False), (40.0, True)])
+def test_a_push_that_takes_little_is_not_sought_again(quick, left, deeper):
+    train, held, base = quick  # 59 variances above the noise, of which a push may leave a third
+    plain = try_candidate(Task(base.model, iterations=1), train, held)
+    tried = []
+
+    def carry_out(function, arguments, what):
+        tried.extend(each[0].effect[0] for each in arguments)
+        return [Failure('not asked here') for _ in arguments]
+
+    def leaving(name):
+        fit_ = replace(plain.train, mse=np.full_like(plain.train.mse, left), converged=False)
+        task = replace(base, effect=(name, None))
+        return replace(plain, task=task, label=name, train=fit_)
+
+    found = {name: leaving(name) for name in ('external_push', 'torque_bias')}
+    halving = SuccessiveHalving(train, held, carry_out)
+    halving._in_more_depth(found, base.base, np.inf, np.inf, 'race')
+    assert 'torque_bias' in tried
+    assert ('external_push' in tried) == deeper
+
+
 def test_a_look_at_a_law_without_states_goes_on_from_where_the_base_stands(quick):
     _, _, base = quick
     laws = {name: nominal_with(base.model, name) for name in ('torque_bias', 'backlash')}

@@ -230,7 +230,8 @@ class SuccessiveHalving:
         gained: dict[str, float] = {}
         for iterations in settings.HALVING.rungs[1:]:
             limit = min(earned, worth_having(_best(found), base))
-            going = _may_still_win(found, gained, beaten, limit)
+            going = [o for o in _may_still_win(found, gained, beaten, limit)
+                     if not eventful(o.task) or _is_rid_of_most(o, base)]  # fmt: skip
             again = self._fitted(
                 [replace(o.task, warm_starts=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
@@ -362,6 +363,12 @@ def _reach(best: float) -> float:
 def _most_of(error: float) -> float:
     """chi2/N down to which most of an error is explained."""
     return max(settings.NOISE.nothing_left, error / settings.HALVING.mostly)
+
+
+def _is_rid_of_most(o: Outcome, base: Fit | None) -> bool:
+    """Whether events may still come to leave what they may: half of what they lack is there."""
+    missing = (1 + settings.SELECTION.mishap) / 2 * (_error(base) - 1)
+    return o.train.normalised_error - 1 < missing
 
 
 def _favoured(best: float) -> float:
