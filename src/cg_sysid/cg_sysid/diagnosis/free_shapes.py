@@ -14,7 +14,7 @@ from cg_dynamics.effects.effect import Effect
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
-from cg_sysid.search.model_selection import Comparison, above_noise, at_noise
+from cg_sysid.search.model_selection import Comparison, above_noise, at_noise, settled
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.standings import title_of
 
@@ -89,6 +89,20 @@ def with_shapes_of_causes(work: Workspace, o: Outcome) -> Outcome:
     ((judged, found),) = work.selection.compare(o, [found]).ranked
     earned = judged.evidence > settings.SELECTION.earned and judged.held_gain > 0
     return found if earned else o
+
+
+def explained_by_own_shapes(work: Workspace, o: Outcome) -> bool:
+    """Whether causes explain all once their own laws are drawn as the machine has them."""
+    prefixes = tuple(f'{label}.' for label in work.added(o))
+    bounds = {
+        name: declared.leeway for name, declared in o.model.declarations.items()
+        if declared.leeway and name.startswith(prefixes)
+    }  # fmt: skip
+    if o.task.bounds or not bounds:
+        return False
+    title = f'{title_of(work.added(o))}, its laws in other shapes'
+    found = work.halving.fit([_again(o, bounds)], title)[0]
+    return isinstance(found, Outcome) and settled(found)
 
 
 def _shapes_at(o: Outcome, labels: Sequence[str]) -> Bounds:

@@ -6,7 +6,11 @@ from dataclasses import replace
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted, worth_a_look
-from cg_sysid.diagnosis.free_shapes import with_hard_friction, with_mixed_friction
+from cg_sysid.diagnosis.free_shapes import (
+    explained_by_own_shapes,
+    with_hard_friction,
+    with_mixed_friction,
+)
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
@@ -125,9 +129,10 @@ def with_law(work: Workspace, final: Outcome) -> Outcome:
 def rather_one_cause(work: Workspace, plain: Outcome, faulty: Outcome) -> Outcome | None:
     """One effect that alone explains more than all small faults together, if there is one.
 
-    Together they can imitate much, but hardly down to the last of it.
+    Together they can imitate much, but hardly down to the last of it. What the causes explain by
+    themselves, with laws of another shape, asks for no other effect.
     """
-    if faulty is plain or settled(plain):
+    if faulty is plain or settled(plain) or explained_by_own_shapes(work, plain):
         return None
     comparison = compare(work, plain, faulty, beside_one_joint(work, plain, faulty))
     plain, winner = comparison.base, comparison.winner()
