@@ -64,6 +64,7 @@ def test_what_is_not_earned_goes_for_what_is(search):
 def test_what_was_left_before_any_cause_is_known(search, monkeypatch):
     work, base, own, _ = search
     monkeypatch.setattr(work, 'comparisons', {})
+    monkeypatch.setattr(work, 'torques', {})
     monkeypatch.setattr(work.selection, 'before_causes', np.inf)
     monkeypatch.setattr(comparing, 'done', lambda work, o: True)
     comparing.compare(work, own)

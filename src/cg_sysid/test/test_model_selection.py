@@ -169,6 +169,7 @@ def _after_causes(fitted, monkeypatch):
         (10.0, 3.9, True),
         (12.0, 11.0, True),  # more than a thousandth of what the causes explain: not their laws
         (1.35, 1.29, True),  # what comes to the noise explains
+        (0.98, 0.97, True),  # nothing is left there
     ],
 )
 def test_what_takes_the_edge_off_what_causes_leave_is_none(

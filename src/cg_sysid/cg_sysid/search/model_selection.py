@@ -292,7 +292,8 @@ class ModelSelection:
 
     def _is_remainder(self, base: Outcome) -> bool:
         """Whether the laws of the causes, were they a little off, would leave as much."""
-        return above_noise(base) < settings.SELECTION.remainder * self.before_causes < np.inf
+        most = settings.SELECTION.remainder * self.before_causes
+        return 0 < above_noise(base) < most < np.inf
 
     def whiteness(self, o: Outcome) -> float:
         """Share of independent samples in what is left; 1 of white noise."""
