@@ -231,7 +231,7 @@ class SuccessiveHalving:
         for iterations in settings.HALVING.rungs[1:]:
             limit = min(earned, worth_having(_best(found), base))
             going = [o for o in _may_still_win(found, gained, beaten, limit)
-                     if not eventful(o.task) or _is_rid_of_most(o, base)]  # fmt: skip
+                     if not eventful(o.task) or _has_taken_half(o, base)]  # fmt: skip
             again = self._fitted(
                 [replace(o.task, warm_starts=(o.train,), iterations=iterations) for o in going],
                 f'{what}, in more depth',
@@ -365,10 +365,10 @@ def _most_of(error: float) -> float:
     return max(settings.NOISE.nothing_left, error / settings.HALVING.mostly)
 
 
-def _is_rid_of_most(o: Outcome, base: Fit | None) -> bool:
-    """Whether events may still come to leave what they may: half of what they lack is there."""
-    missing = (1 + settings.SELECTION.mishap) / 2 * (_error(base) - 1)
-    return o.train.normalised_error - 1 < missing
+def _has_taken_half(o: Outcome, base: Fit | None) -> bool:
+    """Whether events have taken half of the error above the noise that they have to take."""
+    most = (1 + settings.SELECTION.mishap) / 2 * (_error(base) - 1)
+    return o.train.normalised_error - 1 < most
 
 
 def _favoured(best: float) -> float:
