@@ -398,21 +398,21 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
     if described:
         shares = ', '.join(f'{share:.0%}' for share in described)
         lines += ['', f'Share of the error that a learned term takes, unlisted: {shares}.']
-    all_of_them = f'All {len(rows)} cases:'
+    lines += ['', f'All {len(rows)} cases:', '']
     if took == 'wall_s':
-        wall = [row[took] for row in rows if took in row]
-        all_of_them += (
-            f' {unit.removeprefix("s ")} median {np.median(wall):.0f} s, 95 % '
-            f'{np.quantile(wall, 0.95):.0f} s, longest {max(wall):.0f} s;'
-        )
+        lines.append(f'- {_spread([row[took] for row in rows if took in row])} {unit[2:]}.')
+    endless = sum(row['verdict'] == 'unfinished' for row in rows)
     lines += [
-        '',
-        f'{all_of_them} CPU time median {np.median(cpu):.0f} s, 95 % '
-        f'{np.quantile(cpu, 0.95):.0f} s, longest {max(cpu):.0f} s, with the compilation of '
-        'models that no case before had; '
-        f'{sum(row["verdict"] == "unfinished" for row in rows)} without an end.',
+        f'- {_spread(cpu)} of CPU time. Models that no case before had are compiled within it.',
+        f'- {endless} without an end.',
     ]
     return lines
+
+
+def _spread(seconds: Sequence[float]) -> str:
+    """Times in words."""
+    median, late, longest = np.quantile(seconds, [0.5, 0.95, 1.0])
+    return f'Median {median:.0f} s, 95 % {late:.0f} s, longest {longest:.0f} s'
 
 
 def _time_of(rows: list[dict[str, Any]]) -> tuple[str, str]:

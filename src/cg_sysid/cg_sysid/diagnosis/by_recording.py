@@ -126,7 +126,7 @@ def _fit_with_own(
 ) -> Fit | Failure:
     """A fit to all records where every recording has its own size of the effect that is named.
 
-    At first a few iterations in company: to compile dozens of models takes three times as long.
+    At first a few iterations in company: to compile dozens of models would take longer.
     """
     model = with_own(o.model, name, at, o.train.model) if name else o.model
     bounds = o.task.bounds
