@@ -13,6 +13,7 @@
    cg_dynamics/hybrid.py. Rollouts have clocks of their own: a lane that ends takes the next one
    of its leg from a queue, and one that lands goes to the queue of the other leg. */
 
+#include <math.h>
 #include <stdlib.h>
 
 #define LAW (1 + 2 * NL)

@@ -5,6 +5,8 @@
      rates(x, u, s, dx)     dx/dt
    and the sizes NX, NU, NP, SHARED. Rows, holding of inputs and steps are those of rollout.c. */
 
+#include <math.h>
+
 static int steps_of(double dt, double largest)
 {
     int n = (int)ceil(dt / largest * (1 - 1e-9));

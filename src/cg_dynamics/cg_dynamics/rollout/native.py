@@ -35,6 +35,8 @@ from cg_dynamics.rollout.vector_code import (
     vector_math,
 )
 
+ALONE = 2  # lanes of a vector that holds one rollout: the least there are
+
 
 class NativeRollout:
     """The functions of rollout.c for one set of equations; arguments are those of fallback.py.
@@ -225,32 +227,24 @@ def symbols_of(e: Equations, free: tuple[str, ...]) -> ca.SX:
 
 
 def states_source(e: Equations) -> str:
-    """C of the rollouts of a model.
+    """C of what rollout.c asks of a model.
 
     Raises:
         UnsupportedError: for an operation that has no vector form.
     """
-    rates, shared_f = _vectorised(e, 'rates', 'prepare_rates', ca.densify(e.rates))
-    outputs, shared_h = _vectorised(e, 'seen', 'prepare_outputs', ca.densify(e.outputs))
-    given = {
-        'WIDTH': 2, 'NX': e.x.shape[0], 'NU': e.u.shape[0], 'NP': max(e.p.shape[0], 1),
-        'NY': e.outputs.shape[0], 'SHARED': shared_f + shared_h,
-        'SCALES': f'{{{", ".join(map(str, e.state_scales))}}}',
-        'STATE_LIMIT': STATE_LIMIT, 'HALVINGS': HALVINGS, 'EASY': EASY,
-    }  # fmt: skip
-    return _with_sizes(given, '\n'.join([
-        vector_math(), rates, outputs, _prepare(shared_f),
-        f'#define outputs(x, u, s, y) seen(x, u, s + {shared_f}, y)',
-        _file('rollout.c'),
+    rates, shared_f = _vectorised(e, 'rates_of', 'prepare_rates', ca.densify(e.rates))
+    outputs, shared_h = _vectorised(e, 'outputs_of', 'prepare_outputs', ca.densify(e.outputs))
+    scales = ', '.join(map(str, e.state_scales))
+    return _with_sizes({'WIDTH': ALONE}, '\n'.join([
+        vector_math(), _file('rollout.h'), rates, outputs,
+        f'const int parameter_count = {max(e.p.shape[0], 1)}, shared = {shared_f + shared_h};',
+        f'const double state_scale[] = {{{scales}}};',
+        'void prepare(const vd *p, vd *s)',
+        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared_f}); }}',
+        'void rates(const vd *x, const vd *u, const vd *s, vd *dx) { rates_of(x, u, s, dx); }',
+        'void outputs(const vd *x, const vd *u, const vd *s, vd *y)',
+        f'{{ outputs_of(x, u, s + {shared_f}, y); }}',
     ]))  # fmt: skip
-
-
-def _prepare(shared: int) -> str:
-    """C of `prepare`: what rates need of the parameters, then what outputs do."""
-    return (
-        'static void prepare(const vd *p, vd *s)\n'
-        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared}); }}'
-    )
 
 
 def windows_source(e: Equations, free: tuple[str, ...]) -> str:
@@ -277,7 +271,8 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
     lines = [
         vector_math(), _file('windows.h'), rates, outputs,
         '#define COLUMNS (NX + NF + 1)',
-        _prepare(shared_f),
+        'static void prepare(const vd *p, vd *s)',
+        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared_f}); }}',
         _entries('BY_INPUT', in_b), _entries('BY_FREE', in_p),
         'static inline void times(const vd *o, const vd *a, vd *b)',
         '{',
@@ -344,14 +339,23 @@ def _with_sizes(given: dict, source: str) -> str:
 
 
 def _states_library(e: Equations) -> Path:
-    return shared_library(states_source(e), FLAGS)
+    given = {
+        'WIDTH': ALONE, 'NX': e.x.shape[0], 'NU': e.u.shape[0], 'NY': e.outputs.shape[0],
+        'STATE_LIMIT': STATE_LIMIT, 'HALVINGS': HALVINGS, 'EASY': EASY,
+    }  # fmt: skip
+    rollout = _common_object(given, 'rollout')
+    return shared_library(states_source(e), FLAGS, [rollout])
 
 
 def _windows_library(e: Equations, free: tuple[str, ...]) -> Path:
-    given = {'WIDTH': WIDTH, 'HALVINGS': HALVINGS, 'STABLE': STABLE}
-    common = '\n'.join([vector_math(), _file('windows.h'), _file('windows.c')])
-    windows = object_file(_with_sizes(given, common), FLAGS)
+    windows = _common_object({'WIDTH': WIDTH, 'HALVINGS': HALVINGS, 'STABLE': STABLE}, 'windows')
     return shared_library(windows_source(e, free), FLAGS, [windows])
+
+
+def _common_object(given: dict, name: str) -> Path:
+    """What models share: a C file below vector_math.c and its header."""
+    lines = [vector_math(), _file(f'{name}.h'), _file(f'{name}.c')]
+    return object_file(_with_sizes(given, '\n'.join(lines)), FLAGS)
 
 
 _NUMBER, _COUNT = ctypes.c_double, ctypes.c_int

@@ -1,12 +1,9 @@
-/* Rollouts of one compiled model.
+/* Rollouts of a compiled model.
 
-   Included below vector_math.c and the code that rollout.py writes for the model:
-     prepare(p, s)             expressions of the parameters alone, SHARED of them
-     rates(x, u, s, dx)        dx/dt
-     outputs(x, u, s, y)       what the sensors see
-   and the sizes NX, NU, NP, NY, the SCALES of the states, and what fallback.py says of STATE_LIMIT
-   and of steps. A vector holds one rollout in its first lane: the code is that of many rollouts,
-   and with what is prepared and its short elementary functions faster than C for one.
+   Compiled once for models of the sizes NX, NU and NY, below vector_math.c, rollout.h and what
+   fallback.py says of STATE_LIMIT and of steps, and linked to each model's own code. A vector holds
+   one rollout in its first lane: the code is that of many rollouts, and with what is prepared and
+   its short elementary functions faster than C for one.
 
    Rows k = 0 .. n-1 are instants; the input of row k is held until row k+1, dt[k] later. */
 
@@ -52,15 +49,15 @@ static void first_lane(int n, const vd *from, double *to)
 
 static void prepared(const double *p, vd *s)
 {
-    vd parameters[NP];
-    splat(NP, p, parameters);
+    vd parameters[parameter_count];
+    splat(parameter_count, p, parameters);
     prepare(parameters, s);
 }
 
 /* n Runge-Kutta steps of h seconds, in place. */
 void cgm_advance(double *state, const double *input, const double *p, double h, int n)
 {
-    vd s[SHARED + 1], x[NX], u[NU], y[NX], k4[NX];
+    vd s[shared + 1], x[NX], u[NU], y[NX], k4[NX];
     prepared(p, s);
     splat(NX, state, x), splat(NU, input, u);
     for (int i = 0; i < n; i++) {
@@ -75,13 +72,12 @@ void cgm_advance(double *state, const double *input, const double *p, double h, 
 static double error_of(const vd *x, const vd *y, const vd *k4, const vd *u, const vd *s, double h,
                        double tolerance)
 {
-    static const double scale[NX] = SCALES;
     vd k5[NX];
     double error = 0;
     rates(y, u, s, k5);
     for (int i = 0; i < NX; i++) {
-        const double size = fabs(x[i][0]);
-        const double own = fabs(h / 6 * (k4[i][0] - k5[i][0])) / (scale[i] * (size > 1 ? size : 1));
+        const double size = fabs(x[i][0]), unit = state_scale[i] * (size > 1 ? size : 1);
+        const double own = fabs(h / 6 * (k4[i][0] - k5[i][0])) / unit;
         /* What is no number is no error: the state has run away, which is found after the step. */
         error = own > error ? own : error;
     }
@@ -133,7 +129,7 @@ int cgm_simulate(int n, const double *dt, double largest, double tolerance, int 
                  int *steps)
 {
     Pace pace = {.halvings = halvings};
-    vd s[SHARED + 1], x[NX], u[NU];
+    vd s[shared + 1], x[NX], u[NU];
     prepared(p, s);
     splat(NX, x0, x);
     memcpy(X, x0, NX * sizeof(double));
@@ -174,7 +170,7 @@ static void interpolate(double h, double past, const vd *x0, const vd *d0, const
 void cgm_outputs(int n, const double *time, const double *inputs, const double *p, const double *X,
                  const double *delay, double *Y)
 {
-    vd s[SHARED + 1], u[NU], y[NY], x[NX], x0[NX], x1[NX], d0[NX], d1[NX];
+    vd s[shared + 1], u[NU], y[NY], x[NX], x0[NX], x1[NX], d0[NX], d1[NX];
     prepared(p, s);
     for (int k = 0; k < n; k++) {
         splat(NX, X + k * NX, x), splat(NU, inputs + k * NU, u);

@@ -7,6 +7,7 @@
    the sizes HALVINGS and STABLE, and linked to each model's own code. Columns of a window: its first
    state, the free parameters by place[nf] (-1: held constant), and the delay by late (or -1). */
 
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
