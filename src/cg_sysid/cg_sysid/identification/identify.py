@@ -55,11 +55,12 @@ STEADY = 0.1  # change of the logarithm of the weights at which they count as se
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
 CENTRAL = 1e-2  # weight of the border of consistency over what is still to be gained, [1]
 DRIFT = 1e-5  # relative change of the cost at which a fit has converged
+FAR_DRIFT = 1e-3  # the same of one that is not CLOSE to the noise
 LEADING = 3e-2  # the same of one that only leads the way
 SETTLING = 12  # iterations of a robot around a rotor, at most
 LOST = 0.1  # share of the variance of the data, from which a simulation goes its own way
 BACK = 5  # steps across a valley after one uphill, at most
-CLOSE = 1e6  # chi2/N; farther from the noise nobody needs the floor of a valley
+CLOSE = 1e4  # chi2/N; farther from the noise nobody needs the floor of a valley
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
@@ -459,7 +460,8 @@ def _descend(
         progress(WHOLE, len(stages) + k, len(stages) + rounds, _so_far(found))
         # Under weights that nobody knows yet a minimum is none.
         leads = reweight and not k and rounds > 1 and weight == 1.0
-        drift = LEADING if leads else 0.0 if thorough else DRIFT
+        close = found.point is None or _error(found.point) < CLOSE
+        drift = LEADING if leads else 0.0 if thorough else DRIFT if close else FAR_DRIFT
         found = _minimise(
             problem, found.theta, found.motions, longest, weight, at_once, drift, reach,
             valley=valley, damping=damping, trial=found.trial,
