@@ -35,6 +35,7 @@ from cg_sysid.identification.simulation_error import (
     moved,
     own_values,
     reduced,
+    settled,
 )
 from cg_sysid.identification.uncertainty import not_asked, uncertainty
 from cg_sysid.identification.unknowns import (
@@ -576,6 +577,8 @@ def _minimise(
         if _out_of_reach(errors, reach):
             return end(False, hopeless=True)
         trial = ahead(theta, motions, point, damping)
+        if trial is not None and here is not None and not cost_of(trial) < point.cost:
+            trial = settled(trial, here, weight)
         for _ in range(BACK if _error(point) < CLOSE else 0):
             if not point.cost < cost_of(trial) < valley.uphill * point.cost:
                 break

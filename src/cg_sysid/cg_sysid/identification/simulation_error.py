@@ -7,7 +7,7 @@ data sets are pieces of one recording and share something of its own, they are e
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -23,6 +23,10 @@ from cg_sysid.parallel import side_by_side
 
 RUNAWAY = 1e60
 LOST = 1e-30  # curvature beside the steepest one, below which there is none
+SPOILT = 1.1  # times what a block did cost: more, and one squared sigma, is a step led astray
+FEW = 0.25  # share of the blocks, up to which it is they that are astray and not the step
+SETTLING_STEPS = 4  # of a block by itself
+SETTLING_DAMPING = 1e-3
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 
 
@@ -233,6 +237,11 @@ class Followed:
     start: np.ndarray
     column: np.ndarray
 
+    @property
+    def away(self) -> bool:
+        """Whether the simulation runs away."""
+        return self.judged.rows < self.rows
+
     def normal(self, keep: bool = False) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
         """Normal equations and, if kept, outputs and Jacobian.
 
@@ -277,6 +286,8 @@ class Trial:
         motions: What each data set has of its own.
         followed: The simulations.
         border: What keeps bodies possible there.
+        horizon: How far they go, in s.
+        known: Normal equations of data sets, by their numbers, as far as they were asked for.
     """
 
     problem: Problem
@@ -284,6 +295,8 @@ class Trial:
     motions: list[np.ndarray]
     followed: list[Followed]
     border: Border
+    horizon: float
+    known: dict[int, Normal] = field(default_factory=dict)
 
     @functools.cached_property
     def sse(self) -> np.ndarray:
@@ -322,19 +335,27 @@ class Trial:
             self.cost_of_data(weight) + disbelief @ disbelief + barrier * self.border.cost
         )
 
-    @functools.cached_property
-    def normals(self) -> list[Normal]:
-        """Of each data set, by values and not coordinates."""
-        return list(side_by_side(lambda followed: followed.normal()[0], self.followed))
+    def cost_of_block(self, block: 'Block', weight: float) -> float:
+        """The part of `cost_of_data` that is a block's."""
+        away = self.away(weight)
+        return float(
+            sum(weight * self.sse[i].sum() + away[i] @ away[i] for i in block.data_sets)
+        )  # fmt: skip
 
-    def point(self, weight: float) -> Point | None:
-        """The normal equations; None where the sensitivities run away, if the motion does not."""
-        problem, k = self.problem, len(self.theta)
-        chain = problem.chain(problem.values(self.theta))
-        shared_h, shared_g = np.zeros((k, k)), np.zeros(k)
-        own: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        for i, (normal, away) in enumerate(zip(self.normals, self.away(weight), strict=True)):
-            m2 = len(self.motions[i])
+    def equations(
+        self, data_sets: Sequence[int], weight: float
+    ) -> list[tuple[np.ndarray, np.ndarray]] | None:
+        """Curvature and gradient of data sets, by what each has of its own, then the coordinates.
+
+        None where the sensitivities run away, if the motion does not.
+        """
+        problem, chain = self.problem, self.problem.chain(self.problem.values(self.theta))
+        unknown = [i for i in data_sets if i not in self.known]
+        normals = side_by_side(lambda i: self.followed[i].normal()[0], unknown)
+        self.known.update(zip(unknown, normals, strict=True))
+        found = []
+        for i in data_sets:
+            normal, m2 = self.known[i], len(self.motions[i])
             if not np.abs(normal.hessian).max() < RUNAWAY:
                 return None
             h, g = normal.hessian * weight, normal.gradient * weight
@@ -342,15 +363,25 @@ class Trial:
             h[:, m2:] *= chain
             g[m2:] *= chain
             spread = problem.spread(i, weight)
-            own_h = h[:m2, :m2] + np.diag(1 / spread**2)
-            own_g = g[:m2] + away / spread
-            own[i] = own_h, h[:m2, m2:], own_g
-            shared_h += h[m2:, m2:]
-            shared_g += g[m2:]
+            h[:m2, :m2] += np.diag(1 / spread**2)
+            g[:m2] += (self.motions[i] - problem.guesses[i]) / spread**2
+            found.append((h, g))
+        return found
+
+    def point(self, weight: float) -> Point | None:
+        """The normal equations; None where the sensitivities run away, if the motion does not."""
+        problem, k = self.problem, len(self.theta)
+        found = self.equations(range(len(self.followed)), weight)
+        if found is None:
+            return None
+        shared_h = np.sum([h[-k:, -k:] for h, _ in found], axis=0) if k else np.zeros((0, 0))
+        shared_g = np.sum([g[-k:] for _, g in found], axis=0) if k else np.zeros(0)
         tolerances = np.array([u.tolerance for u in problem.unknowns])
         shared_g += self.disbelief() / tolerances
         shared_h += np.diag(1 / tolerances**2)
-        blocks = [_together(block, own, k) for block in problem.blocks]
+        blocks = [
+            _together(block, [found[i] for i in block.data_sets]) for block in problem.blocks
+        ]
         point = Point(
             self.cost(weight, 0.0), shared_h, shared_g, blocks, self.sse, self.count,
             self.cost_of_data(weight), self.border,
@@ -375,20 +406,68 @@ def attempt(
     followed = list(side_by_side(
         lambda i: follow(problem, i, values, motions[i], horizon), range(len(problem.data_sets))
     ))  # fmt: skip
-    if any(each.judged.rows < each.rows for each in followed):
+    if any(each.away for each in followed):
         return None
-    return Trial(problem, theta, motions, followed, border)
+    return Trial(problem, theta, motions, followed, border, horizon)
+
+
+def settled(trial: Trial, before: Trial, weight: float) -> Trial:
+    """A trial after the few blocks that its step led astray have settled by themselves.
+
+    What a block has of its own moves with a step as if its error were quadratic. Where it is not,
+    as where a joint with dry friction turns round, one window of many would spoil the step of all.
+    """
+    blocks = trial.problem.blocks
+    enough = [SPOILT * before.cost_of_block(block, weight) + 1 for block in blocks]
+    astray = [
+        k for k, block in enumerate(blocks) if trial.cost_of_block(block, weight) > enough[k]
+    ]
+    if len(astray) > FEW * len(blocks):
+        return trial
+    for k in astray:
+        trial = _settled(trial, blocks[k], enough[k], weight)
+    return trial
+
+
+def _settled(trial: Trial, block: Block, enough: float, weight: float) -> Trial:
+    """What a block has of its own, fitted at the trial's coordinates until it costs so little."""
+    problem, damping, values = trial.problem, SETTLING_DAMPING, trial.problem.values(trial.theta)
+    for _ in range(SETTLING_STEPS):
+        found = trial.equations(block.data_sets, weight)
+        if found is None:
+            break
+        curvature, _, gradient = _together(block, found)
+        curvature += damping * np.diag(np.diag(curvature))
+        move = -solve(curvature, gradient[:, None])[:, 0]
+        motions, followed = list(trial.motions), list(trial.followed)
+        for i, place in zip(block.data_sets, block.places, strict=True):
+            motions[i] = trial.motions[i] + move[place]
+            followed[i] = follow(problem, i, values, motions[i], trial.horizon)
+        known = {i: n for i, n in trial.known.items() if i not in block.data_sets}
+        other = replace(trial, motions=motions, followed=followed, known=known)
+        cost = np.inf if any(followed[i].away for i in block.data_sets) else (
+            other.cost_of_block(block, weight)
+        )  # fmt: skip
+        if cost < trial.cost_of_block(block, weight):
+            trial, damping = other, damping / 10
+            if cost < enough:
+                break
+        else:
+            damping *= 100
+    return trial
 
 
 def _together(
-    block: Block, own: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]], k: int
+    block: Block, found: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvature, coupling to the k shared unknowns and gradient of a block."""
+    """Curvature, coupling to the shared unknowns and gradient of a block's own unknowns."""
+    k = len(found[0][1]) - len(block.places[0])
     d, e, g = np.zeros((block.size, block.size)), np.zeros((block.size, k)), np.zeros(block.size)
-    for i, place in zip(block.data_sets, block.places, strict=True):
-        d[np.ix_(place, place)] += own[i][0]
-        e[place] += own[i][1]
-        g[place] += own[i][2]
+    for (h, gradient), place in zip(found, block.places, strict=True):
+        m2 = len(place)
+        d[np.ix_(place, place)] += h[:m2, :m2]
+        e[place] += h[:m2, m2:]
+        g[place] += gradient[:m2]
     return d, e, g
 
 
