@@ -7,7 +7,7 @@ data sets are pieces of one recording and share something of its own, they are e
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -238,8 +238,8 @@ class Followed:
     column: np.ndarray
 
     @property
-    def away(self) -> bool:
-        """Whether the simulation runs away."""
+    def gone(self) -> bool:
+        """Whether the simulation has run away."""
         return self.judged.rows < self.rows
 
     def normal(self, keep: bool = False) -> tuple[Normal, np.ndarray | None, np.ndarray | None]:
@@ -308,14 +308,9 @@ class Trial:
         """Samples behind it."""
         return np.array([followed.judged.count for followed in self.followed])
 
-    def away(self, weight: float) -> list[np.ndarray]:
-        """How far what each data set has of its own is from its first guess, in spreads."""
-        return [
-            (motion - guess) / self.problem.spread(i, weight)
-            for i, (motion, guess) in enumerate(
-                zip(self.motions, self.problem.guesses, strict=True)
-            )
-        ]
+    def away(self, i: int, weight: float) -> np.ndarray:
+        """How far what data set i has of its own is from its first guess, in spreads."""
+        return (self.motions[i] - self.problem.guesses[i]) / self.problem.spread(i, weight)
 
     def disbelief(self) -> np.ndarray:
         """How far the unknowns are from what the model file believes, in its tolerances."""
@@ -324,9 +319,14 @@ class Trial:
             for coordinate, u in zip(self.theta, self.problem.unknowns, strict=True)
         ])  # fmt: skip
 
+    def cost_of(self, data_sets: Iterable[int], weight: float) -> float:
+        """Of the data of some data sets, and of what each has of its own."""
+        away = {i: self.away(i, weight) for i in data_sets}
+        return float(sum(weight * self.sse[i].sum() + own @ own for i, own in away.items()))
+
     def cost_of_data(self, weight: float) -> float:
-        """Of the data, and of what each data set has of its own."""
-        return float(weight * self.sse.sum() + sum(away @ away for away in self.away(weight)))
+        """The same of all."""
+        return self.cost_of(range(len(self.followed)), weight)
 
     def cost(self, weight: float, barrier: float = BARRIER) -> float:
         """Cost with so much weight of the data and of the border."""
@@ -334,13 +334,6 @@ class Trial:
         return float(
             self.cost_of_data(weight) + disbelief @ disbelief + barrier * self.border.cost
         )
-
-    def cost_of_block(self, block: 'Block', weight: float) -> float:
-        """The part of `cost_of_data` that is a block's."""
-        away = self.away(weight)
-        return float(
-            sum(weight * self.sse[i].sum() + away[i] @ away[i] for i in block.data_sets)
-        )  # fmt: skip
 
     def equations(
         self, data_sets: Sequence[int], weight: float
@@ -364,7 +357,7 @@ class Trial:
             g[m2:] *= chain
             spread = problem.spread(i, weight)
             h[:m2, :m2] += np.diag(1 / spread**2)
-            g[:m2] += (self.motions[i] - problem.guesses[i]) / spread**2
+            g[:m2] += self.away(i, weight) / spread
             found.append((h, g))
         return found
 
@@ -406,7 +399,7 @@ def attempt(
     followed = list(side_by_side(
         lambda i: follow(problem, i, values, motions[i], horizon), range(len(problem.data_sets))
     ))  # fmt: skip
-    if any(each.away for each in followed):
+    if any(each.gone for each in followed):
         return None
     return Trial(problem, theta, motions, followed, border, horizon)
 
@@ -417,15 +410,15 @@ def settled(trial: Trial, before: Trial, weight: float) -> Trial:
     What a block has of its own moves with a step as if its error were quadratic. Where it is not,
     as where a joint with dry friction turns round, one window of many would spoil the step of all.
     """
-    blocks = trial.problem.blocks
-    enough = [SPOILT * before.cost_of_block(block, weight) + 1 for block in blocks]
-    astray = [
-        k for k, block in enumerate(blocks) if trial.cost_of_block(block, weight) > enough[k]
-    ]
-    if len(astray) > FEW * len(blocks):
+    astray = []
+    for block in trial.problem.blocks:
+        enough = SPOILT * before.cost_of(block.data_sets, weight) + 1
+        if trial.cost_of(block.data_sets, weight) > enough:
+            astray.append((block, enough))
+    if len(astray) > FEW * len(trial.problem.blocks):
         return trial
-    for k in astray:
-        trial = _settled(trial, blocks[k], enough[k], weight)
+    for block, enough in astray:
+        trial = _settled(trial, block, enough, weight)
     return trial
 
 
@@ -445,10 +438,9 @@ def _settled(trial: Trial, block: Block, enough: float, weight: float) -> Trial:
             followed[i] = follow(problem, i, values, motions[i], trial.horizon)
         known = {i: n for i, n in trial.known.items() if i not in block.data_sets}
         other = replace(trial, motions=motions, followed=followed, known=known)
-        cost = np.inf if any(followed[i].away for i in block.data_sets) else (
-            other.cost_of_block(block, weight)
-        )  # fmt: skip
-        if cost < trial.cost_of_block(block, weight):
+        gone = any(followed[i].gone for i in block.data_sets)
+        cost = np.inf if gone else other.cost_of(block.data_sets, weight)
+        if cost < trial.cost_of(block.data_sets, weight):
             trial, damping = other, damping / 10
             if cost < enough:
                 break
