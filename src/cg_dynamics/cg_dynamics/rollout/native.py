@@ -239,12 +239,19 @@ def states_source(e: Equations) -> str:
         vector_math(), _file('rollout.h'), rates, outputs,
         f'const int parameter_count = {max(e.p.shape[0], 1)}, shared = {shared_f + shared_h};',
         f'const double state_scale[] = {{{scales}}};',
-        'void prepare(const vd *p, vd *s)',
-        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared_f}); }}',
+        _prepare(shared_f),
         'void rates(const vd *x, const vd *u, const vd *s, vd *dx) { rates_of(x, u, s, dx); }',
         'void outputs(const vd *x, const vd *u, const vd *s, vd *y)',
         f'{{ outputs_of(x, u, s + {shared_f}, y); }}',
     ]))  # fmt: skip
+
+
+def _prepare(shared: int) -> str:
+    """C of `prepare`: what rates need of the parameters, then what outputs do."""
+    return (
+        'void prepare(const vd *p, vd *s)\n'
+        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared}); }}'
+    )
 
 
 def windows_source(e: Equations, free: tuple[str, ...]) -> str:
@@ -271,8 +278,7 @@ def windows_source(e: Equations, free: tuple[str, ...]) -> str:
     lines = [
         vector_math(), _file('windows.h'), rates, outputs,
         '#define COLUMNS (NX + NF + 1)',
-        'static void prepare(const vd *p, vd *s)',
-        f'{{ prepare_rates(p, s); prepare_outputs(p, s + {shared_f}); }}',
+        f'static {_prepare(shared_f)}',
         _entries('BY_INPUT', in_b), _entries('BY_FREE', in_p),
         'static inline void times(const vd *o, const vd *a, vd *b)',
         '{',

@@ -577,7 +577,7 @@ def _minimise(
         if _out_of_reach(errors, reach):
             return end(False, hopeless=True)
         trial = ahead(theta, motions, point, damping)
-        if trial is not None and here is not None and not cost_of(trial) < point.cost:
+        if trial is not None and here and not cost_of(trial) < point.cost:
             trial = settled(trial, here, weight)
         for _ in range(BACK if _error(point) < CLOSE else 0):
             if not point.cost < cost_of(trial) < valley.uphill * point.cost:

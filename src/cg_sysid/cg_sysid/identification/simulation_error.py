@@ -26,7 +26,7 @@ LOST = 1e-30  # curvature beside the steepest one, below which there is none
 SPOILT = 1.1  # times what a block did cost: more, and one squared sigma, is a step led astray
 FEW = 0.25  # share of the blocks, up to which it is they that are astray and not the step
 SETTLING_STEPS = 4  # of a block by itself
-SETTLING_DAMPING = 1e-3
+SETTLING_DAMPING = 1e-3  # of the first of them
 BARRIER = 1e-2  # weight of the physical-consistency barrier, in units of one squared sigma
 
 
@@ -445,7 +445,7 @@ def _settled(trial: Trial, block: Block, enough: float, weight: float) -> Trial:
             if cost < enough:
                 break
         else:
-            damping *= 100
+            damping *= 100  # few steps are left
     return trial
 
 
