@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
 SETUP = 'stance: inner\nfixture: inner_fixed\n'
 PATIENCE = 200.0  # s
-AGAIN = 3  # times that steps are walked through again where a host lost samples
+AGAIN = 5  # times that steps are walked through again where a host lost samples
 
 
 @pytest.fixture

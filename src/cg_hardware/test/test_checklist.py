@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 from robot_in_memory import LIMIT, RobotInMemory
 
 from cg_dynamics.model import Model
-from cg_hardware.checklist import record
+from cg_hardware.checklist import measuring, record
 from cg_hardware.checklist.plan import Plan
 from cg_hardware.checklist.robot import Quit
 from cg_hardware.checklist.sensing import judge_rates
@@ -154,6 +155,38 @@ def test_rates_are_judged_by_numbers(name, value, words):
     judged = judge_rates(numbers | {name: value}, PLAN)
     assert not judged.passed
     assert words in judged.reason
+
+
+def told(stamps):
+    stamps = np.asarray(stamps)
+    return measuring.rate_of(measuring.Series(stamps, stamps + 1_000_000, np.zeros(len(stamps))))
+
+
+def test_what_is_lost_is_missing_and_not_uneven():
+    even = np.arange(2000) * 2_000_000
+    kept = np.delete(even, np.r_[300:310, 700, 900, 1501:1506])  # 17 samples
+    found = told(kept)
+    assert found['missing'] == pytest.approx(17 / 1999)
+    assert found['jitter_ms'] == pytest.approx(0.0, abs=1e-9)
+    assert found['rate_hz'] == pytest.approx(500.0)
+    assert found['age_ms'] == 1.0
+
+
+def test_what_is_late_and_caught_up_is_uneven_and_not_missing():
+    stamps = np.arange(2000) * 2_000_000
+    for held_up in range(100, 1900, 60):  # 6 ms, and four samples in the 2 ms after it
+        stamps[held_up : held_up + 4] = stamps[held_up + 3] + np.arange(4) * 500_000
+    found = told(stamps)
+    assert found['missing'] == pytest.approx(0.0, abs=1e-9)
+    assert found['jitter_ms'] > 0.2
+    assert found['rate_hz'] == pytest.approx(500.0)
+
+
+def test_samples_that_come_two_at_a_time_are_uneven():
+    found = told(np.repeat(np.arange(1000) * 4_000_000, 2))
+    assert found['rate_hz'] == pytest.approx(500.0)
+    assert found['missing'] == pytest.approx(0.0, abs=1e-3)
+    assert found['jitter_ms'] == pytest.approx(1.0, rel=0.01)
 
 
 def made(steps, date='2026-03-04T10:12:00Z', **changes):

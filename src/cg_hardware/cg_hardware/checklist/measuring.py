@@ -12,7 +12,7 @@ from cg_dynamics.rig import Setup
 
 NS_PER_S = 1_000_000_000
 FEWEST = 40  # samples that tell anything
-LATE = 1.5  # periods between two stamps beyond which a sample is missing
+SOME = 10  # periods over which one is taken: a few that come late and are caught up do not matter
 ROUGH = 0.05  # rad/s over which dry friction turns round in the fit of an inertia
 LEAST_TRAVEL = 0.01  # rad below which friction has held a joint
 CLEAR = 5.0  # standard errors that an inertia is from none
@@ -92,15 +92,17 @@ def rate_of(series: Series) -> dict[str, float]:
     """
     if len(series) < FEWEST:
         return {'rate_hz': 0.0, 'jitter_ms': math.nan, 'missing': 1.0, 'age_ms': math.nan}
-    periods = np.diff(series.stamp_ns)
-    period = float(np.median(periods))
-    span = float(series.stamp_ns[-1] - series.stamp_ns[0])
-    expected = span / period if period > 0 else math.inf
-    late = periods[periods > LATE * period]
+    stamps = np.asarray(series.stamp_ns)
+    period = float(np.median(stamps[SOME:] - stamps[:-SOME])) / SOME
+    if period <= 0:
+        return {'rate_hz': math.inf, 'jitter_ms': math.nan, 'missing': 1.0, 'age_ms': math.nan}
+    periods = np.diff(stamps) / period
     return {
-        'rate_hz': NS_PER_S / period if period > 0 else math.inf,
-        'jitter_ms': float(np.std(periods[periods <= LATE * period])) / 1e6,
-        'missing': float(np.sum(late / period - 1.0)) / expected,
+        'rate_hz': NS_PER_S / period,
+        # Periods that are lost are missing and not uneven.
+        'jitter_ms': float(np.std(periods - np.maximum(1.0, np.rint(periods)))) * period / 1e6,
+        # What comes late and is caught up is uneven and not missing.
+        'missing': max(0.0, 1.0 - len(periods) / float(np.sum(periods))),
         'age_ms': float(np.median(series.received_ns - series.stamp_ns)) / 1e6,
     }
 
