@@ -11,8 +11,8 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.errors import Failure
 from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification import identify
 from cg_sysid.identification.data_set import pieces, prepare
+from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.identify import COARSE, fit
 from cg_sysid.search import candidates, settings
 from cg_sysid.search.candidates import (
@@ -369,5 +369,5 @@ def test_first_looks_at_a_robot_take_fine_steps():
 @pytest.mark.parametrize(('reach', 'lost'), [(5.9, True), (6.1, False)])
 def test_three_steps_have_to_gain_a_third_of_what_is_lacking(reach, lost):
     # From 10 to 9 in three steps, unevenly: three times that leads to 6, and no further.
-    assert identify._out_of_reach([12.0, 10.0, 9.8, 9.5, 9.0], reach) == lost
-    assert not identify._out_of_reach([10.0, 9.8, 9.5], reach)  # too soon to tell
+    assert out_of_reach([12.0, 10.0, 9.8, 9.5, 9.0], reach) == lost
+    assert not out_of_reach([10.0, 9.8, 9.5], reach)  # too soon to tell

@@ -288,6 +288,27 @@ def test_records_are_followed_as_far_as_the_torques_are_right(believed):
     assert 0 < cuts[0] < cuts[1]
 
 
+def test_a_fit_that_will_not_come_below_what_is_beaten_is_broken_off(believed, monkeypatch):
+    walked = []
+    residuals = torque_error.residuals
+    monkeypatch.setattr(
+        torque_error, 'residuals', lambda *a: walked.append(1) or residuals(*a)
+    )  # fmt: skip
+    train = data(believed.with_values(OFF), believed)
+
+    def fitted(beaten):
+        walked.clear()
+        (found,) = fits_by_torque([believed], train, beaten=beaten)
+        return found, len(walked)
+
+    patient, steps = fitted(np.inf)
+    near, same = fitted(patient.deviance + 1.0)
+    assert (near.values, same) == (patient.values, steps)
+    far, fewer = fitted(patient.deviance - 1e4)
+    assert fewer < steps
+    assert far.deviance > patient.deviance
+
+
 def test_what_strains_the_belief_is_fitted_afresh(believed):
     """A load on the last link, whose own numbers take it over first, far from their belief."""
     load = {'mass': 1.1, 'x': 0.01, 'y': 0.02, 'z': -0.2}

@@ -25,6 +25,7 @@ from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.deadline import check_time
 from cg_sysid.identification import along_motion, kept_fits, torque_error
 from cg_sysid.identification.data_set import DataSet, prepare
+from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.information_criterion import weight_of
 from cg_sysid.identification.simulation_error import (
     BARRIER,
@@ -66,10 +67,8 @@ ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may 
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
 REFINED = 2.0  # integration steps of a thorough fit in place of one
 COARSE = 0.25  # the same of a first look: what needs short steps, as stiff teeth, is told later
-PATIENCE = 3  # iterations over which a fit that is out of reach has to gain
 DAMPING = 1e-3  # of the first step
 SHORT = 0.5  # damping from which a step is short
-HOPE = 3.0  # times that gain, within which it may still come there
 WHOLE = 'fitting whole records, in rounds until it settles'
 ORDER = 0.5  # relative standard deviation from which not even the order of a number is known
 Progress = Callable[[str, int, int, str], None]
@@ -574,7 +573,7 @@ def _minimise(
 
     for _ in range(iterations):
         check_time()
-        if _out_of_reach(errors, reach):
+        if out_of_reach(errors, reach):
             return end(False, hopeless=True)
         trial = ahead(theta, motions, point, damping)
         if trial is not None and here and not cost_of(trial) < point.cost:
@@ -619,13 +618,6 @@ def _minimise(
 
 def _error(point: Point) -> float:
     return float(point.sse.sum() / point.count.sum())
-
-
-def _out_of_reach(errors: Sequence[float], reach: float) -> bool:
-    """Whether errors that fell like this will not soon come to what matters."""
-    if len(errors) <= PATIENCE:
-        return False
-    return errors[-1] - reach > HOPE * (errors[-1 - PATIENCE] - errors[-1])
 
 
 def _straight(problem: Problem, step: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ from cg_dynamics.rig import Setup
 from cg_sysid.identification import along_motion
 from cg_sysid.identification.along_motion import AlongMotion, Samples
 from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
 
 HALF_WIDTH_S = 0.06  # of the window of a local polynomial: motions up to some 5 Hz
@@ -224,13 +225,15 @@ def fits_by_torque(
     at: Mapping[str, float] | None = None,
     followed: int | None = None,
     quick: bool = False,
+    beaten: float = np.inf,
 ) -> list[TorqueFit]:
     """The same for models that differ in their values only, from each; none without a record.
 
     Those that differ in nothing that the torques see, as in a delay, are fitted once. Of more than
     `followed` fits the best go on to their minimum, after the first few iterations of all. With
     `quick` the windows are those of a rotor that moves by itself, whether there is one or not:
-    likelihoods are compared over the same.
+    likelihoods are compared over the same. Fits that will not come below the deviance that is
+    `beaten` are broken off.
     """
     names = seen_by_torques(models[0])
     unknowns = [
@@ -251,12 +254,12 @@ def fits_by_torque(
     firsts = {key: keys.index(key) for key in keys}
     many = followed is not None and len(firsts) > followed
     fitted = {
-        key: _best(starts[k], unknowns[k], at or {}, HEAT if many else ITERATIONS)
+        key: _best(starts[k], unknowns[k], at or {}, HEAT if many else ITERATIONS, beaten)
         for key, k in firsts.items()
     }
     for key in sorted(fitted, key=lambda key: fitted[key].deviance)[:followed] if many else ():
         k = firsts[key]
-        fitted[key] = _descend(starts[k], unknowns[k], fitted[key].values)
+        fitted[key] = _descend(starts[k], unknowns[k], fitted[key].values, ITERATIONS, beaten)
     found = []
     for key, own in zip(keys, unknowns, strict=True):
         # What the torques do not see is left where it was.
@@ -272,20 +275,21 @@ def _best(
     unknowns: Sequence[Unknown],
     at: Mapping[str, float],
     iterations: int,
+    beaten: float,
 ) -> TorqueFit:
     """From given values and, where these strain the belief, from what is believed as well.
 
     What an effect more could take over from strained numbers lies far off, along a curved valley
     of numbers that the torques cannot tell apart.
     """
-    found = _descend(problems, unknowns, at, iterations)
+    found = _descend(problems, unknowns, at, iterations, beaten)
     strained = any(
         abs(u.to_coordinate(at[u.name]) - u.to_coordinate(u.prior)) > STRAINED * u.tolerance
         for u in unknowns if u.name in at
     )  # fmt: skip
     if not strained:
         return found
-    afresh = _descend(problems, unknowns, {}, iterations)
+    afresh = _descend(problems, unknowns, {}, iterations, beaten)
     return min(found, afresh, key=lambda fitted: fitted.deviance)
 
 
@@ -293,7 +297,8 @@ def _descend(
     problems: Sequence['Problem'],
     unknowns: Sequence[Unknown],
     at: Mapping[str, float],
-    iterations: int = ITERATIONS,
+    iterations: int,
+    beaten: float,
 ) -> TorqueFit:
     """From a start to the minimum: Gauss-Newton, damped, with the weights of (T).
 
@@ -312,7 +317,10 @@ def _descend(
     residual = residuals(problems, unknowns, theta)
     damping, patience = DAMPING, PATIENCE
     cost, little_is = deviance_of(residual, theta), SETTLED * residual.size
+    costs = [cost]
     for _ in range(iterations if np.isfinite(cost) else 0):
+        if out_of_reach(costs, beaten):
+            break
         of_rows = row_scale(residual, scale_of(residual))
         r = (residual / of_rows).ravel()
         with np.errstate(over='ignore', invalid='ignore'):
@@ -340,6 +348,7 @@ def _descend(
         patience -= little
         settled = little and (promised < little_is or not patience)
         theta, residual, cost = tried, new_residual, new_cost
+        costs.append(cost)
         if settled:
             break
     acted = np.sqrt(np.mean(np.vstack([p.acted for p in problems]) ** 2, axis=0))

@@ -703,15 +703,19 @@ def _by_torque(
     if settled:
         unknowns = unknowns_of(models[0], only, task.bounds)
         only = [u.name for u in unknowns if not u.name.startswith(settled)]
-    found = torque_error.fits_by_torque(models, few, only, task.bounds, at=at, followed=followed)
+    beaten, rival = np.inf, task.rival
+    if rival is not None and tried is not None and along_motion.follows(tried):
+        by_torque = torque_error.fits_by_torque(
+            [rival.model], few, None, rival.bounds, at=rival.at, quick=True
+        )
+        beaten = min((f.deviance for f in by_torque), default=np.inf) + settings.SCREENING.clearly
+    found = torque_error.fits_by_torque(
+        models, few, only, task.bounds, at=at, followed=followed, beaten=beaten
+    )
     if not found:
         return led
-    if task.rival is not None and tried is not None and along_motion.follows(tried):
-        rival = torque_error.fits_by_torque(
-            [task.rival.model], few, None, task.rival.bounds, at=task.rival.at, quick=True
-        )
-        if min(f.deviance for f in found) > rival[0].deviance + settings.SCREENING.clearly:
-            raise RuledOut
+    if min(f.deviance for f in found) > beaten:
+        raise RuledOut
     led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led
