@@ -3,7 +3,8 @@
 Deadlines mean something on a host that has its processors for the test. One that other programs
 keep busy is waited for, and a test that fails while the host wakes nobody in time tells nothing.
 Both are skipped, and the reason says what was measured. The end of a run tells how many were, and
-with CG_NO_EXCUSE set, on a host that is known to keep time, none is.
+with CG_NO_EXCUSE set, on a host that is known to keep time, none is. A run that excuses many of
+them shows too little, and fails.
 """
 
 import fcntl
@@ -43,6 +44,7 @@ while os.getppid() == parent:
 _EXCUSES = _OTHERS_RUN, _WOKEN_LATE, _ = (
     'other programs have', 'the host wakes a thread', 'the host held the emulation up',
 )  # fmt: skip
+_MOST_EXCUSED = 0.5  # of the tests with deadlines of a run
 _watch = pytest.StashKey[subprocess.Popen]()
 _waited = pytest.StashKey[float]()
 
@@ -113,13 +115,33 @@ def _excused(item):
 
 def pytest_terminal_summary(terminalreporter):
     """How much of what keeps deadlines this run does not show."""
-    skipped = terminalreporter.stats.get('skipped', [])
-    excused = sum(any(why in str(r.longrepr) for why in _EXCUSES) for r in skipped)
+    excused, kept = _deadlines(terminalreporter)
     if excused:
         terminalreporter.write_line(
             f'{excused} tests with deadlines were skipped, as this host does not keep time: the '
             'run shows nothing of them (CG_NO_EXCUSE=1 runs them all the same)'
         )
+    if excused > _MOST_EXCUSED * (excused + kept):
+        terminalreporter.write_line(
+            f'No more than {kept} were run: too few, the run has failed. Run it on an idle host.'
+        )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session):
+    """A host that excuses many tests has not passed them."""
+    reporter = session.config.pluginmanager.get_plugin('terminalreporter')
+    if reporter is not None and session.exitstatus == pytest.ExitCode.OK:
+        excused, kept = _deadlines(reporter)
+        if excused > _MOST_EXCUSED * (excused + kept):
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _deadlines(reporter):
+    """Of the tests that keep deadlines: how many the host excused, and how many passed."""
+    skipped = reporter.stats.get('skipped', [])
+    excused = sum(any(why in str(r.longrepr) for why in _EXCUSES) for r in skipped)
+    return excused, sum('alone' in r.keywords for r in reporter.stats.get('passed', []))
 
 
 def _processors_in_use() -> float:
