@@ -1,7 +1,7 @@
 """Rollouts of one model in machine code: rollout.c for its states, windows.c for sensitivities.
 
 A rollout is simulated once, step by step. Its sensitivities obey linear equations along it, so
-that eight windows of it are integrated side by side in the lanes of one register, by the very
+that windows of it are integrated side by side, eight in the lanes of one register, by the very
 steps that the rollout took, and chained:
 
     S(t) = Phi_w(t) S(t_w) + Gamma_w(t)      for t in window w, which begins at t_w
@@ -11,7 +11,6 @@ with Phi_w, Gamma_w the derivatives by the window's first state and by the param
 
 import ctypes
 import functools
-from dataclasses import dataclass
 from pathlib import Path
 
 import casadi as ca
@@ -27,6 +26,7 @@ from cg_dynamics.rollout.fallback import (
     InterpretedRollout,
     Simulated,
 )
+from cg_dynamics.rollout.lanes import Lanes, window_edges
 from cg_dynamics.rollout.vector_code import (
     FLAGS,
     WIDTH,
@@ -131,22 +131,28 @@ class NativeRollout:
             )  # fmt: skip
             return
         active = np.flatnonzero(column >= 0)
-        lanes = _Lanes.of(time, float(delay.max(initial=0.0)), self.nx, len(active), delay_column)
+        late = float(delay.max(initial=0.0))
+        taken = np.bitwise_count(steps[:-1].view(np.uint32)).sum(axis=1)
+        # Windows of a late sensor begin early, and more of them would do more rows twice.
+        edges = window_edges(taken if late == 0.0 else np.ones(n - 1))
+        lanes = Lanes.of(time, edges, late, self.nx, len(active), delay_column)
         place = np.full(len(column), -1, np.int32)
         place[active] = self.nx + np.arange(len(active))
         own_delay = {column[f]: place[f] for f in active}
-        k = lanes.columns
-        hessian, gradient = np.zeros((WIDTH, k, k)), np.zeros((WIDTH, k))
-        handed = np.zeros((WIDTH, self.nx, k))
+        late_outputs = np.array([own_delay.get(c, -1) for c in delay_to], np.int32)
+        k, weights = lanes.columns, there * weight
+        hessian, gradient = np.zeros((lanes.padded, k, k)), np.zeros((lanes.padded, k))
+        handed = np.zeros((lanes.padded, self.nx, k))
         by_lane = None if Jacobian is None else np.zeros((n, self.ny, k))
-        if not kernel(
-            lanes.first, lanes.length, lanes.start, lanes.until, lanes.handed, time, largest,
-            u, du, p, k, place, lanes.late, simulated.states, steps.shape[1], steps, residual,
-            there * weight, delay,
-            np.array([own_delay.get(c, -1) for c in delay_to], np.int32), hessian, gradient,
-            handed, by_lane,
-        ):  # fmt: skip
-            raise MemoryError(f'no memory for the sensitivities of {n} rows of late sensors')
+        for a in range(0, lanes.padded, WIDTH):
+            at = slice(a, a + WIDTH)
+            if not kernel(
+                lanes.first[at], lanes.length[at], lanes.start[at], lanes.until[at],
+                lanes.handed[at], time, largest, u, du, p, k, place, lanes.late,
+                simulated.states, steps.shape[1], steps, residual, weights, delay,
+                late_outputs, hessian[at], gradient[at], handed[at], by_lane,
+            ):  # fmt: skip
+                raise MemoryError(f'no memory for the sensitivities of {n} rows of late sensors')
         # d(a window's columns)/d(columns): those of its first state, and the same for all windows.
         S, shared = np.empty((lanes.count, self.nx, nc)), np.zeros((k - self.nx, nc))
         shared[np.arange(len(active)), column[active]] = 1.0
@@ -172,52 +178,6 @@ class NativeRollout:
                 judged = slice(first + lanes.start[w], first + lanes.until[w])
                 Jacobian[judged] = by_lane[judged][:, :, own] @ S[w]
                 Jacobian[judged] += by_lane[judged][:, :, rest] @ shared
-
-
-@dataclass(frozen=True)
-class _Lanes:
-    """Windows of a record, as windows.c wants them; arrays of shape (WIDTH,).
-
-    Attributes:
-        count: How many of the lanes have a window.
-        first: First row of each: early enough for what a late sensor saw.
-        length: Rows of each.
-        start: Its first row that counts, from `first`.
-        until: The first that does not count any more.
-        handed: The first row of the next window.
-        late: Column of the delay of the inputs, or -1.
-        columns: Number of columns.
-    """
-
-    count: int
-    first: np.ndarray
-    length: np.ndarray
-    start: np.ndarray
-    until: np.ndarray
-    handed: np.ndarray
-    late: int
-    columns: int
-
-    @classmethod
-    def of(cls, time: np.ndarray, delay: float, nx: int, active: int, delay_column: int):
-        """Windows of equal length."""
-        n = len(time)
-        count = min(WIDTH, max(1, n - 1))
-        edges = np.linspace(0, n - 1, count + 1).astype(int)
-        first = np.searchsorted(time, time[edges[:-1]] - delay, side='right') - 1
-        first = np.minimum(np.maximum(first, 0), edges[:-1])
-        last = np.append(edges[1:-1], n - 1)
-        until = np.append(edges[1:-1], n)
-        handed = np.append(first[1:], n) - first
-
-        def padded(a, empty):
-            return np.array([*a, *[empty] * (WIDTH - count)], np.int32)
-
-        late = nx + active if delay_column >= 0 else -1
-        return cls(
-            count, padded(first, 0), padded(last - first + 1, 1), padded(edges[:-1] - first, 0),
-            padded(until - first, 0), padded(handed, -1), late, nx + active + (late >= 0),
-        )  # fmt: skip
 
 
 def symbols_of(e: Equations, free: tuple[str, ...]) -> ca.SX:
