@@ -81,7 +81,7 @@ def mend_clocks(raw: RawRecording) -> tuple[RawRecording, list[Finding]]:
             if jumped and (len(event) == len(topics) or _starts_with_others(topics, jump)):
                 mended[jump.topic] = _without(mended[jump.topic], jump)
                 findings.append(_finding(jump, topics[jump.topic], origin, repaired=True))
-            elif jumped or jump.excess_ns < 0:
+            elif jumped or _goes_back(topics[jump.topic], jump):
                 findings.append(_finding(jump, topics[jump.topic], origin, repaired=False))
     return replace(raw, topics=mended), findings
 
@@ -180,6 +180,14 @@ def _events(jumps: Sequence[Jump], topics: dict[str, RawTopic]) -> Iterator[list
                 same.setdefault(jump.topic, jump)
         yield list(same.values())
         left = [jump for jump in left if same.get(jump.topic) is not jump]
+
+
+def _goes_back(topic: RawTopic, jump: Jump) -> bool:
+    """Whether time runs backwards, which needs no witness.
+
+    A loop in software that was late for a few samples comes back by a short spacing.
+    """
+    return bool(topic.stamp_ns[jump.sample] <= jump.before_ns)
 
 
 def _witness(topic: RawTopic, jump: Jump) -> float:
