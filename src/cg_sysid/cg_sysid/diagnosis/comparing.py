@@ -6,6 +6,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes
+from cg_sysid.diagnosis.simpler import with_simpler_one
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
@@ -49,7 +50,8 @@ def compare(
                 task, effects, title, error, work.selection.to_be_earned(base),
                 base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
-        comparison = less_shapes(work, work.selection.compare(base, outcomes))
+        comparison = with_simpler_one(work, work.selection.compare(base, outcomes))
+        comparison = less_shapes(work, comparison)
         comparison = compared_with_free_shapes(work, comparison)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
