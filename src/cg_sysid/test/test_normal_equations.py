@@ -128,6 +128,23 @@ def test_only_a_round_whose_weights_nobody_knows_stops_early(model_file, monkeyp
         assert set(drifts) == {identify.DRIFT}
 
 
+def test_what_has_no_curvature_left_stays_and_the_others_step():
+    """The start of a record makes up for the first unknown, but for what is lost in rounding."""
+    lost = 1e-14
+    shared, coupling = np.array([[9.0, 1.0], [1.0, 5.0]]), np.array([[3.0, 2.0]])
+    nothing = np.zeros((1, 1))
+    for left in (lost, 0.0, -lost):
+        point = Point(
+            cost=1.0, shared_hessian=shared + np.diag([9.0 * left, 0.0]),
+            shared_gradient=np.array([1e-3, 7.0]),
+            own=[(np.eye(1), coupling, np.array([2.0]))], sse=nothing, count=nothing,
+            data_cost=1.0, border=Border(0.0, np.zeros(2), np.zeros((2, 2))),
+        )  # fmt: skip
+        step, _ = identify._step(point, 0.0, np.array([False, False]))
+        # Schur complements: 5 - 2 * 2 and 7 - 2 * 2.
+        np.testing.assert_allclose(step, [0.0, -3.0])
+
+
 def test_a_curvature_that_rounding_turned_is_solved_at_once():
     # Of a record of a robot whose sensitivities ran away; LAPACK went on for minutes with it.
     column = np.array([1e9, 1e16, 3e13, 1e13, 5e15])

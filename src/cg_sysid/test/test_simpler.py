@@ -1,4 +1,4 @@
-"""A winner whose numbers end where a simpler effect begins: that one is judged beside it."""
+"""A cause whose numbers end where a simpler effect begins is told by that one's name."""
 
 from dataclasses import replace
 
@@ -6,47 +6,66 @@ import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.simpler import turned_into, with_simpler_one
+from cg_sysid.diagnosis.causes import cause_among
+from cg_sysid.diagnosis.simpler import simplified, turned_into
+from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, chi2, parameters_of, try_candidate
 
 WITH_SHARE, WITHOUT = 'motor_side_friction', 'joint_flexibility'
 DRIVE = {'stiffness': 6.0, 'damping': 0.2, 'rotor_inertia': 0.05}
+NONE = pytest.mark.parametrize('search', [0.0], indirect=True)
+MOST = pytest.mark.parametrize('search', [0.6], indirect=True)
 
 
-@pytest.fixture(scope='module', params=[0.0, 0.6])
+@pytest.fixture(scope='module')
 def search(request, model_file):
     """A workspace and the richer effect alone on top of the base, by its share in the machine."""
     nominal = Model.load(model_file)
     machine = nominal.with_effect(WITH_SHARE, share=request.param, **DRIVE)
     work = search_for(nominal, machine)
-    base = try_candidate(Task(nominal), work.train, work.held)
-    rich = try_candidate(Task(nominal, (WITH_SHARE, None), base=base.train), work.train, work.held)
-    return request.param, work, work.selection.compare(base, [rich])
+    rich = try_candidate(Task(nominal, (WITH_SHARE, None)), work.train, work.held)
+    return work, rich
 
 
+@NONE
 def test_a_share_of_nothing_is_the_simpler_effect(search):
-    share, work, alone = search
-    judged = with_simpler_one(work, alone)
-    labels = [candidate.label for candidate, _ in judged.ranked]
-    if share:
-        assert labels == [WITH_SHARE]
-        return
-    assert sorted(labels) == [WITHOUT, WITH_SHARE]
-    assert judged.winner()[0].label == WITHOUT
-    # It is at the same minimum, as near as fits to 1000 samples come: two units of chi2 are a nat.
-    rich, simple = (judged.of(label)[1] for label in (WITH_SHARE, WITHOUT))
-    assert chi2(simple) < chi2(rich) + 2 * judged.margin
+    work, rich = search
+    simple = simplified(work, rich)
+    assert work.added(simple) == {WITHOUT}
+    assert simple.label == WITHOUT
+    # The same minimum, with the numbers that the machine has.
+    assert chi2(simple) < chi2(rich) + 2 * settings.SELECTION.earned
     ((number, (value, sigma, _)), *_) = parameters_of(simple, WITHOUT).items()
     assert number == 'stiffness'
     assert abs(value - DRIVE['stiffness']) < 3.3 * sigma
-    # Who has it already is not fitted once more.
-    assert with_simpler_one(work, judged) is judged
+    assert simplified(work, simple) is simple
 
 
+@MOST
+def test_a_share_stays_where_it_is_needed(search):
+    """Though that of one fit may end at nothing."""
+    work, rich = search
+    assert simplified(work, rich) is rich
+    model = rich.train.model.with_values({f'{WITH_SHARE}.share': 0.0})
+    ended = replace(rich, train=replace(rich.train, model=model))
+    assert simplified(work, ended) is ended
+
+
+@MOST
 def test_only_a_number_that_ends_at_nothing_turns_an_effect(search):
-    _, _, alone = search
-    ((_, rich),) = alone.ranked
+    _, rich = search
     for share, simpler in ((0.0, WITHOUT), (0.3, None), (1.0, None)):
         model = rich.train.model.with_values({f'{WITH_SHARE}.share': share})
-        turned = turned_into(replace(rich, train=replace(rich.train, model=model)))
+        turned = turned_into(replace(rich, train=replace(rich.train, model=model)), WITH_SHARE)
         assert (turned and turned[0]) == simpler
+
+
+@NONE
+def test_its_evidence_is_that_of_the_richer_one(search):
+    work, rich = search
+    base = try_candidate(Task(work.nominal), work.train, work.held)
+    comparison = work.selection.compare(base, [rich])
+    cause = cause_among(simplified(work, rich), WITHOUT, [comparison])
+    assert cause.label == WITHOUT
+    assert cause.evidence == comparison.ranked[0][0].evidence
+    assert cause.rivals == ()

@@ -131,18 +131,20 @@ def _idle(o: Outcome, label: str, other: str) -> bool:
 
 def cause_among(final: Outcome, label: str, comparisons: Sequence[Comparison]) -> Cause:
     """The cause, judged by the comparison that had the most beside it."""
-    known = [c for c in comparisons if (own := c.of(label)) and not own[0].reason]
-    if not known:
-        return as_in(final, Cause(label, parameters_of(final, label), float('inf')))
-    comparison = max(known, key=lambda c: len(c.base.model.effects))
-    return as_in(final, _cause(final, label, comparison))
+    richer = {c.label for x in comparisons for c, _ in x.ranked if contains(c.label, label)}
+    for name in (label, *sorted(richer)):  # one that has turned into it was judged (simpler.py)
+        known = [c for c in comparisons if (own := c.of(name)) and not own[0].reason]
+        if known:
+            comparison = max(known, key=lambda c: len(c.base.model.effects))
+            return as_in(final, _cause(final, label, name, comparison))
+    return as_in(final, Cause(label, parameters_of(final, label), float('inf')))
 
 
-def _cause(final: Outcome, label: str, comparison: Comparison) -> Cause:
-    own = comparison.of(label)
+def _cause(final: Outcome, label: str, judged: str, comparison: Comparison) -> Cause:
+    own = comparison.of(judged)
     assert own is not None
     name = effect_name(label)
-    close = comparison.close_to(label)
+    close = comparison.close_to(judged)
     return Cause(
         label,
         parameters_of(final, label),

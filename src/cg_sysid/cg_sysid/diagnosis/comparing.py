@@ -6,7 +6,6 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes
-from cg_sysid.diagnosis.simpler import with_simpler_one
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
@@ -50,8 +49,7 @@ def compare(
                 task, effects, title, error, work.selection.to_be_earned(base),
                 base.held.normalised_error, work.selection.only_beliefs(base),
             )  # fmt: skip
-        comparison = with_simpler_one(work, work.selection.compare(base, outcomes))
-        comparison = less_shapes(work, comparison)
+        comparison = less_shapes(work, work.selection.compare(base, outcomes))
         comparison = compared_with_free_shapes(work, comparison)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
@@ -164,7 +162,8 @@ def refitted(work: Workspace, o: Outcome) -> Outcome:
     """
     if settled(o) or finished(work, o):
         return o
-    task = Task(o.model, events=o.events, bounds=o.task.bounds)
+    reach = settings.HALVING.as_good * o.train.normalised_error
+    task = Task(o.model, events=o.events, bounds=o.task.bounds, reach=reach)
     again = work.halving.fit([task], f'{o.label} again')
     better = [a for a in again if isinstance(a, Outcome) and chi2(a) < chi2(o)]
     return replace(better[0], label=o.label) if better else o

@@ -1,6 +1,7 @@
 """Forward selection: one effect after the other, until nothing more is earned."""
 
 from cg_sysid.diagnosis.comparing import compare, done, refitted
+from cg_sysid.diagnosis.simpler import simplified
 from cg_sysid.diagnosis.small_faults import (
     bare,
     law_at_once,
@@ -21,7 +22,7 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
     work.found = o
     while len(work.added(o)) < work.options.rounds and not finished(work, o):
         plain = o
-        o, winner = raced(work, with_small_faults(work, plain))
+        o, winner = raced(work, simplified(work, with_small_faults(work, plain)))
         waiting = work.faulty.get(work.added(plain))
         if winner is None and waiting is not None and no_help(o, waiting):
             # They were to wait for a cause, and none was found without them.
@@ -32,7 +33,7 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         if work.law is not None:
             break
         if winner is not None:
-            o = work.found = refitted(work, winner)
+            o = work.found = simplified(work, refitted(work, winner))
             continue
         if plain is o and o.task.bounds and not settled(o):
             # They came in before the causes did, and another cause could do without them.

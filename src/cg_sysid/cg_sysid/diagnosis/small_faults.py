@@ -4,6 +4,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from cg_dynamics.effects import LIBRARY
 from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted, worth_a_look
 from cg_sysid.diagnosis.free_shapes import (
@@ -196,10 +198,11 @@ def less_small_faults(work: Workspace, final: Outcome) -> Outcome:
     """Without those small faults that, beside the causes, explain nothing any more."""
     small = nuisances(final.model, final.task.bounds)
     idle = [label for label in sorted(small) if not shows(final, label)]
+    reach = settings.HALVING.as_good * final.train.normalised_error
     for gone in (sorted(small), idle):
         if not gone:
             continue
-        lean = without_small_faults(work, final, gone)
+        lean = without_small_faults(work, final, gone, reach)
         if lean is None:
             continue
         if work.selection.compare(lean, [final]).ranked[0][0].evidence < settings.SELECTION.earned:
@@ -213,14 +216,19 @@ def bare(work: Workspace, o: Outcome) -> Outcome | None:
     return without_small_faults(work, large, sorted(nuisances(o.model, o.task.bounds)))
 
 
-def without_small_faults(work: Workspace, o: Outcome, gone: Sequence[str]) -> Outcome | None:
-    """The same without the small faults of these labels; None where that cannot be fitted."""
+def without_small_faults(
+    work: Workspace, o: Outcome, gone: Sequence[str], reach: float = np.inf
+) -> Outcome | None:
+    """The same without the small faults of these labels; None where that cannot be fitted.
+
+    What lies beyond a reach (chi2/N) and gains little is not fitted to its end.
+    """
     model, bounds = o.model, dict(o.task.bounds)
     for label in gone:
         model = model.without_effect(label)
         bounds = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
     start = started_from(o.train, model, bounds)
-    task = Task(model, events=o.events, bounds=bounds, warm_starts=(start,))
+    task = Task(model, events=o.events, bounds=bounds, warm_starts=(start,), reach=reach)
     lean = work.halving.fit([task], 'without small faults')[0]
     return None if isinstance(lean, Failure) else lean
 

@@ -639,12 +639,12 @@ def _promised(point: Point, frozen: np.ndarray) -> float:
 
 def _step(point: Point, damping: float, frozen: np.ndarray) -> tuple[np.ndarray, list]:
     h, g, factors = reduced(point, damping)
-    free = ~frozen
+    # What is left of a curvature may be less than its rounding: nothing, or below. Then it stays.
+    curvature = np.diag(h)
+    free = ~frozen & (curvature > ROUNDING * np.diag(point.shared_hessian))
     step = np.zeros(len(g))
     if free.any():
-        # What is left of a curvature may be less than its rounding: nothing, or below.
-        floor = np.maximum(ROUNDING * np.diag(point.shared_hessian)[free], 1e-300)
-        scale = np.sqrt(np.maximum(np.diag(h)[free], floor))
+        scale = np.sqrt(curvature[free])
         scaled = h[np.ix_(free, free)] / np.outer(scale, scale)
         step[free] = -np.linalg.lstsq(scaled, g[free] / scale, rcond=1e-12)[0] / scale
     return step, factors
