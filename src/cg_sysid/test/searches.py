@@ -10,12 +10,16 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 
 
-def search_for(nominal, machine):
-    """A workspace with two records of a machine's swinging legs, one of them held out."""
-    records = [
+def swings_of(machine, count):
+    """Records of a machine's swinging legs."""
+    return [
         rehearse(f'r{k}', machine, Setup(fixture='inner_fixed'), [0.1, 0.0],
                  [lambda t, k=k: 3 * np.sin((3 + k) * t)], 2.0, 0.004, k)
-        for k in range(2)
+        for k in range(count)
     ]  # fmt: skip
-    train, held = ([data_set] for data_set in prepare(nominal, records))
+
+
+def search_for(nominal, machine):
+    """A workspace with two such records, one of them held out."""
+    train, held = ([data_set] for data_set in prepare(nominal, swings_of(machine, 2)))
     return Workspace(nominal, train, held, Options(workers=1), lambda *_: None, None, Deadline())

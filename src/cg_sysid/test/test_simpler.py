@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from searches import search_for
+from searches import search_for, swings_of
 
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.causes import cause_among
+from cg_sysid.diagnosis.diagnose import diagnose
+from cg_sysid.diagnosis.result import Options
 from cg_sysid.diagnosis.simpler import simplified, turned_into
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, chi2, parameters_of, try_candidate
@@ -69,3 +72,15 @@ def test_its_evidence_is_that_of_the_richer_one(search):
     assert cause.label == WITHOUT
     assert cause.evidence == comparison.ranked[0][0].evidence
     assert cause.rivals == ()
+
+
+def test_a_diagnosis_that_tried_only_the_richer_one_names_the_simpler(model_file):
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect(WITHOUT, **DRIVE)
+    records = swings_of(machine, 4)
+    found = diagnose(nominal, records, Options(effects=(WITH_SHARE,), workers=1))
+    (cause,) = found.causes
+    assert cause.label == WITHOUT
+    assert cause.rivals == ()
+    assert np.isfinite(cause.evidence)
+    assert found.extended.held.normalised_error < 1.1

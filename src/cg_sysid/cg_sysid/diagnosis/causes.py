@@ -136,11 +136,12 @@ def cause_among(final: Outcome, label: str, comparisons: Sequence[Comparison]) -
         known = [c for c in comparisons if (own := c.of(name)) and not own[0].reason]
         if known:
             comparison = max(known, key=lambda c: len(c.base.model.effects))
-            return as_in(final, _cause(final, label, name, comparison))
+            return as_in(final, _cause(final, label, comparison, name))
     return as_in(final, Cause(label, parameters_of(final, label), float('inf')))
 
 
-def _cause(final: Outcome, label: str, judged: str, comparison: Comparison) -> Cause:
+def _cause(final: Outcome, label: str, comparison: Comparison, judged: str = '') -> Cause:
+    judged = judged or label
     own = comparison.of(judged)
     assert own is not None
     name = effect_name(label)

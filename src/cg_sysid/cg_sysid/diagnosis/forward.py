@@ -18,11 +18,11 @@ from cg_sysid.search.model_selection import above_noise, settled
 
 
 def extend(work: Workspace, o: Outcome) -> Outcome:
-    """Accept one effect after the other, until nothing more is earned."""
+    """Accept one effect after the other, until nothing more is earned; the simplest that do."""
     work.found = o
     while len(work.added(o)) < work.options.rounds and not finished(work, o):
         plain = o
-        o, winner = raced(work, simplified(work, with_small_faults(work, plain)))
+        o, winner = raced(work, with_small_faults(work, plain))
         waiting = work.faulty.get(work.added(plain))
         if winner is None and waiting is not None and no_help(o, waiting):
             # They were to wait for a cause, and none was found without them.
@@ -33,7 +33,7 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         if work.law is not None:
             break
         if winner is not None:
-            o = work.found = simplified(work, refitted(work, winner))
+            o = work.found = refitted(work, winner)
             continue
         if plain is o and o.task.bounds and not settled(o):
             # They came in before the causes did, and another cause could do without them.
@@ -42,7 +42,8 @@ def extend(work: Workspace, o: Outcome) -> Outcome:
         if cause is None:
             break
         o = cause
-    return o
+    work.found = simplified(work, o) if work.law is None else o
+    return work.found
 
 
 def raced(work: Workspace, base: Outcome) -> tuple[Outcome, Outcome | None]:

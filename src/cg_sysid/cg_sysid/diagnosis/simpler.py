@@ -9,10 +9,9 @@ from dataclasses import replace
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.free_shapes import PURE
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, started_from
+from cg_sysid.search.candidates import Outcome, Task, parameters_of, started_from
 from cg_sysid.search.standings import title_of
 
 
@@ -38,14 +37,14 @@ def simplified(work: Workspace, o: Outcome) -> Outcome:
 def turned_into(o: Outcome, label: str) -> tuple[str, Model] | None:
     """Label of the simpler effect that a cause is, as its numbers stand, and the model with it.
 
-    None where no number of it ends its range at nothing, or no effect has just the others.
+    None where no number of it is nothing to within its uncertainty, or no effect has just the
+    others.
     """
-    effect = o.model.effect(label)
+    effect, sure = o.model.effect(label), parameters_of(o, label)
     values = {p.name: o.train.model.values[f'{label}.{p.name}'] for p in effect.parameters}
     gone = {
-        p.name for p in effect.parameters
-        if 'lower' in p.ends and p.free
-        and values[p.name] - p.lower < PURE * (p.upper - p.lower)
+        p.name for p in effect.parameters if 'lower' in p.ends and p.name in sure
+        and values[p.name] - p.lower <= settings.SELECTION.too_small * sure[p.name][1]
     }  # fmt: skip
     for name in effect.contains if gone else ():
         if {p.name for p in LIBRARY[name].parameters} == values.keys() - gone:
