@@ -105,7 +105,7 @@ def errors(study, model, judges, rows):
     ways = [(judges, fitted)]
     if rows:
         held = from_measured_angles(model.mechanism, judges, fitted, rows)
-        ways.append((held, score(model, held, fitted.own_by_name(judges))))
+        ways.append((held, score(model, held, own=fitted.own_by_name(judges))))
     summaries = []
     for data_sets, found in ways:
         table = []
