@@ -119,6 +119,11 @@ def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):
     )
     wave = replace(found, shape=replace(shape, mean=0.02))
     assert 'that follows the time of the record: repeating every 0.16 s' in wave.text
+    assert '0.21 N m RMS and 0.22 N m at most' in wave.text
+    # What is not sure has no largest value, or one below the mean over the samples.
+    for peak, words in ((0.15, 'where it is largest'), (0.0, 'anywhere')):
+        unsure = replace(wave, shape=replace(wave.shape, peak=peak))
+        assert f'0.21 N m RMS, its size not sure {words}. ' in unsure.text
 
 
 def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):

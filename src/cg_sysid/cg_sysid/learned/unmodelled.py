@@ -108,8 +108,9 @@ class Unmodelled:
             low, high = (number(factor * end, 2) for end in shape.stretch)
             found.append(f'mostly from {low} to {high} {unit}')
         peak = f' and {_quantity(shape.peak, self.effect.unit)} at most'
-        if not shape.peak:
-            peak = ', its size sure nowhere'
+        if shape.peak < shape.rms:
+            where = 'where it is largest' if shape.peak else 'anywhere'
+            peak = f', its size not sure {where}'
         return [*found, f'{_quantity(shape.rms, self.effect.unit)} RMS{peak}']
 
 
