@@ -14,6 +14,7 @@ from cg_sysid.checks import recordings as check
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 from cg_sysid.records import bags
+from cg_sysid.records.clock import lost_behind_stamps
 from cg_sysid.records.findings import OVERRULABLE
 from cg_sysid.records.raw import RawTopic
 
@@ -331,6 +332,22 @@ def test_a_loop_that_was_late_comes_back_by_a_short_spacing(seed):
         log = stamp + rng.uniform(0.3e6, 3.8e6, SAMPLES).astype(int)
         raw = edit(raw, topic, stamp_ns=stamp, log_ns=log, values=values)
     assert not check_recording(raw).of('clock_jump')
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_a_recorder_that_is_held_up_again_and_again_has_lost_nothing(seed):
+    """What is lost would never come back. A torque in steps follows from nothing before it."""
+    raw = synthesise(Synthesis(), seed)
+    rng = np.random.default_rng(seed)
+    waited = 1.0 + rng.uniform(0, 0.2, SAMPLES)  # samples
+    for k in range(300, SAMPLES - 300, 80):
+        waited[k : k + 40] += rng.integers(1, 4)
+    old = raw.topics['/applied_torque']
+    log = np.maximum.accumulate(old.stamp_ns + (2e6 * waited).astype(int))
+    steps = np.repeat(rng.normal(0, 3, SAMPLES // 20), 20)
+    raw = edit(raw, '/applied_torque', log_ns=log, values={'hip_torque': steps})
+    topic = raw.topics['/applied_torque']
+    assert lost_behind_stamps(topic, float(topic.stamp_ns[-1])) == ([], 0)
 
 
 def test_a_switch_is_stamped_when_it_changes():

@@ -139,6 +139,9 @@ def lost_behind_stamps(topic: RawTopic, end_ns: float) -> tuple[list[int], int]:
     for k in found:
         odds += _by_motion(topic, Jump(topic.name, k, 0, round(late[k - 1] * usual)))
     lost = int(late[places].sum())
+    # What is lost never comes back; what a busy recorder held up does.
+    if offset[-FLOOR:].min() - offset[:FLOOR].min() < 0.5 * lost:
+        return [], 0
     if abs(end_ns - topic.stamp_ns[-1] - lost * usual) < 0.25 * min(lost, 6) * usual:
         odds -= WITNESS
     return (found, lost) if found and odds < -SURE else ([], 0)
