@@ -171,7 +171,11 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
         return
     stamp, log = topic.stamp_ns[paced], topic.log_ns[paced]
     change = _change_of_rate(np.diff(log) / NS_PER_S)
-    if change is not None and _change_of_rate(np.diff(stamp) / NS_PER_S) is None:
+    if (
+        change is not None
+        and _change_of_rate(np.diff(stamp) / NS_PER_S) is None
+        and _falls_behind(stamp, log, *change)
+    ):
         k, before, after = change
         yield Finding(
             'sampling_rate_change',
@@ -245,6 +249,17 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
             CLOCK_JUMP_S,
             'the stamps count, not the times of arrival',
         )
+
+
+def _falls_behind(stamp: np.ndarray, log: np.ndarray, k: int, before: float, after: float) -> bool:
+    """Whether arrivals from sample k on drift away from the stamps as their rates say.
+
+    A recorder that was held up catches up again.
+    """
+    offset = (log - stamp) / NS_PER_S
+    promised = (before / after - 1) * (stamp[-1] - stamp[k]) / NS_PER_S
+    drifted = offset[-FLOOR:].min() - offset[max(0, k - FLOOR) : k + 1].min()
+    return bool(abs(drifted - promised) < 0.5 * abs(promised))
 
 
 def _gaps(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Finding]:
