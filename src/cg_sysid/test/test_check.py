@@ -11,6 +11,7 @@ import yaml
 from rich.console import Console
 
 from cg_sysid.checks import recordings as check
+from cg_sysid.checks import timing
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 from cg_sysid.records import bags
@@ -348,6 +349,19 @@ def test_a_recorder_that_is_held_up_again_and_again_has_lost_nothing(seed):
     raw = edit(raw, '/applied_torque', log_ns=log, values={'hip_torque': steps})
     topic = raw.topics['/applied_torque']
     assert lost_behind_stamps(topic, float(topic.stamp_ns[-1])) == ([], 0)
+
+
+@pytest.mark.parametrize('caught_up', [False, True])
+def test_arrivals_are_slower_only_where_they_fall_behind_for_good(caught_up):
+    """At 500 Hz, from sample 800 on at 430; the last ones arrive at once, or do not."""
+    stamp = 2_000_000 * np.arange(1000)
+    late = np.maximum(np.arange(1000) - 800, 0) * (500 / 430 - 1)  # samples
+    if caught_up:
+        late[-20:] = 0.0
+    log = stamp + (2e6 * (1 + late)).astype(int)
+    assert timing._falls_behind(stamp, log, 800, 500.0, 430.0) != caught_up
+    # A rate that rises drifts the other way.
+    assert not timing._falls_behind(stamp, log, 800, 430.0, 500.0)
 
 
 def test_a_switch_is_stamped_when_it_changes():

@@ -15,6 +15,7 @@ from cg_sysid.search import settings
 from cg_sysid.search.candidates import Task, chi2, parameters_of, try_candidate
 
 WITH_SHARE, WITHOUT = 'motor_side_friction', 'joint_flexibility'
+SURELY = 3.3  # standard deviations: 99.9 % of intervals hold
 DRIVE = {'stiffness': 6.0, 'damping': 0.2, 'rotor_inertia': 0.05}
 NONE = pytest.mark.parametrize('search', [0.0], indirect=True)
 MOST = pytest.mark.parametrize('search', [0.6], indirect=True)
@@ -40,7 +41,7 @@ def test_a_share_of_nothing_is_the_simpler_effect(search):
     assert chi2(simple) < chi2(rich) + 2 * settings.SELECTION.earned
     ((number, (value, sigma, _)), *_) = parameters_of(simple, WITHOUT).items()
     assert number == 'stiffness'
-    assert abs(value - DRIVE['stiffness']) < 3.3 * sigma
+    assert abs(value - DRIVE['stiffness']) < SURELY * sigma
     assert simplified(work, simple) is simple
 
 
@@ -83,4 +84,5 @@ def test_a_diagnosis_that_tried_only_the_richer_one_names_the_simpler(model_file
     assert cause.label == WITHOUT
     assert cause.rivals == ()
     assert np.isfinite(cause.evidence)
+    # The records are of that very model; 1000 samples held out spread chi2/N by 0.03.
     assert found.extended.held.normalised_error < 1.1
