@@ -10,7 +10,7 @@ from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.diagnosis.result import Cause
-from cg_sysid.diagnosis.summary import summary_of
+from cg_sysid.diagnosis.summary import described, summary_of
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.gain import Gain
@@ -103,6 +103,12 @@ def test_a_place_is_told_where_the_interval_tells_one(sigma, told):
     assert 'mass = 1.20 \u00b1 0.10 kg' in text
     assert told in text
     assert ('0.17' in text) == (sigma < 0.1)
+
+
+def test_a_cause_whose_numbers_are_of_each_recording_has_no_empty_brackets():
+    assert described(Cause('encoder_zero', {}, 94.0)) == 'encoder_zero'
+    stiff = Cause('joint_flexibility', {'stiffness': (44.0, 1.0, 'N m/rad')}, 94.0)
+    assert described(stiff).startswith('joint_flexibility (stiffness = 44.0 ± 1.0 N m/rad)')
 
 
 def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):

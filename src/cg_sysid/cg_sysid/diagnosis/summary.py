@@ -120,9 +120,10 @@ def described(cause: Cause) -> str:
     numbers = ', '.join(f'{name} {_told(cause, name)}' for name in shared)
     happened = _happened(cause, own) if own else []
     inside = '; '.join(part for part in (*happened, numbers) if part)
+    size = f' ({inside})' if inside else ''  # none of one that acts otherwise in each recording
     rivals = f' or {" or ".join(cause.rivals)}' if cause.rivals else ''
     replaced = f', which replaces {listed(list(cause.replaces))}' if cause.replaces else ''
-    return f'{cause.label} ({inside}){rivals}{replaced}'
+    return f'{cause.label}{size}{rivals}{replaced}'
 
 
 def _of_single_records(cause: Cause) -> tuple[str, ...]:
