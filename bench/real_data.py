@@ -143,9 +143,9 @@ def run(study, data, bags, workers, budget):
     before = cpu_seconds()
     found = diagnose(nominal, used, Options(workers=workers), deadline=Deadline(budget))
     searched = cpu_seconds() - before
-    # The file's beliefs, and the effects found with their values as a start.
+    # To all that may be used: the file's beliefs, and what was found as a start.
     structure = with_priors_of(found.extended.model, nominal, '')
-    extended = fit(structure, prepare(nominal, used)).model
+    extended = fit(structure, prepare(nominal, used), at=found.extended.model.values).model
     rows = {'published': errors(study, nominal, judges, carry)}
     if study.zeroed:
         published = nominal

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_sysid.learned.linear_response import Piece
-from cg_sysid.learned.residual_terms import _waves
+from cg_sysid.learned.linear_response import Piece, Response
+from cg_sysid.learned.residual_terms import _waves, beside_lines
 
 M, SLOTS, STARTS = 30, 7, 4
 ROUNDING = 1e-12  # of sums of 30 products of numbers of size 1, and of turns below 1e3 rad
@@ -73,3 +73,29 @@ def test_waves_are_turned_to_each_frequency(count):
     frequencies = 0.3 + 0.27 * np.arange(count)
     turn = 2 * np.pi * np.outer(s, frequencies)
     np.testing.assert_allclose(_waves(s, frequencies), [np.cos(turn), np.sin(turn)], atol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ('variable', 'share'),
+    [
+        # Two and a half periods, in a second: it is seen to repeat.
+        (lambda t: 2.5 * t, 0.5),
+        # 40 periods in a second: a mass of 1 kg feels their mean.
+        (lambda t: 40.0 * t, 0.0),
+        # Two values only: a line has both.
+        (lambda t: np.where(t < 0.4, 0.0, 0.37), 0.0),
+    ],
+)
+def test_a_wave_that_no_motion_follows_is_a_line(variable, share):
+    # Position is the second integral of a force; what an initial motion explains is left out.
+    time = np.linspace(0, 1, 400)
+    step = np.tri(400) / 400
+    start = np.column_stack([np.ones(400), time])
+    project, _ = np.linalg.qr(start)
+    moved = step @ step
+    moved -= project @ (project.T @ moved)
+    response = Response(np.zeros((1, 400)), np.zeros(400), moved, np.zeros((1, 400)))
+    s = variable(time)
+    waves = [level + np.cos(2 * np.pi * s) for level in (0.03, -0.02)]
+    found = beside_lines([response] * 2, [s] * 2, waves, ['a', 'b'])
+    assert found > share if share else found < 1e-3

@@ -11,6 +11,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.errors import Failure
 from cg_sysid.experiments.rehearsal import rehearse
+from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.identify import COARSE, fit
@@ -309,6 +310,45 @@ def test_what_takes_long_waits_where_it_is_idle_beside_the_best_look(quick, roto
     effects = [(name, None) for name in ('torque_bias', 'payload', 'backlash')]
     SuccessiveHalving(train, held, carry_out).run(base, effects, 'race')
     assert set(tried) == fitted
+
+
+@pytest.mark.parametrize(
+    ('behind', 'left', 'looked_at', 'waits'),
+    [
+        # Of the torques' deviance; what a fit of the one spoken for leaves of 60 variances.
+        (101.0, 20.0, ['backlash'], True),
+        (99.0, 20.0, ['backlash', 'joint_flexibility'], False),
+        # It was not that.
+        (101.0, 40.0, ['backlash', 'joint_flexibility'], False),
+    ],
+)
+def test_a_rotor_that_torques_speak_less_for_waits(behind, left, looked_at, waits):
+    believed = finger.finger()
+    train = finger.data(believed.with_effect('backlash', gap=0.02), 2, 5.0)
+    plain = try_candidate(Task(believed, iterations=1), train, train)
+    first = replace(plain.train, mse=np.full_like(plain.train.mse, 60.0), horizon=2.0)
+    said = {'backlash': 500.0, 'joint_flexibility': 500.0 + behind}
+    looks = []
+
+    def carry_out(function, arguments, what):
+        tasks = [each[0] for each in arguments]
+        if function is candidates.torque_fits:
+            fitted = torque_error.fit_by_torque(believed, train)
+            return [(replace(fitted, deviance=said[t.effect[0]]),) for t in tasks]
+        if function is candidates.screen:
+            looks.extend(t.effect[0] for t in tasks)
+            return [candidates.Screening(t.effect[0], t, left) for t in tasks]
+        if function is undisturbed:
+            return [(None, None)]
+        fits = replace(plain.train, mse=np.full_like(plain.train.mse, left))
+        return [replace(plain, task=t, label=t.effect[0], train=fits) for t in tasks]
+
+    effects = [(name, None) for name in said]
+    base = Task(believed, base=first, first=first)
+    found, aside = SuccessiveHalving(train, train, carry_out).run(base, effects, 'race')
+    assert sorted(looks) == looked_at
+    assert {o.label for o in found} == set(looked_at)
+    assert bool(aside) == waits
 
 
 @pytest.mark.parametrize(('left', 'deeper'), [(42.0, False), (40.0, True)])

@@ -9,6 +9,7 @@ from cg_sysid.diagnosis.free_shapes import compared_with_free_shapes
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
+from cg_sysid.identification import torque_error
 from cg_sysid.search import settings
 from cg_sysid.search.candidates import (
     Outcome,
@@ -158,9 +159,10 @@ def refitted(work: Workspace, o: Outcome) -> Outcome:
     """The same structure from the file's numbers again, if that comes out better.
 
     What stands as the base of a round has to be as good as it can be, or the next effect is
-    accepted for a better fit of this one. At the noise there is no next round.
+    accepted for a better fit of this one. At the noise there is no next round. On a robot each
+    candidate has set out from the file's numbers, as torques lead from there.
     """
-    if settled(o) or finished(work, o):
+    if settled(o) or torque_error.can(o.model) or finished(work, o):
         return o
     reach = settings.HALVING.as_good * o.train.normalised_error
     task = Task(o.model, events=o.events, bounds=o.task.bounds, reach=reach)

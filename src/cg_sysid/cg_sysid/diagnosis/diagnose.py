@@ -217,8 +217,9 @@ def search(work: Workspace) -> Diagnosis:
             if work.added(final) in seen:
                 break
             seen.add(work.added(final))
-        lean = ties_settled(work, base, less_small_faults(work, final))
-        if lean is not final:  # else nothing has changed since they were asked
+        fewer = less_small_faults(work, final)
+        lean = ties_settled(work, base, fewer)
+        if lean is not fewer:  # else nothing has changed since they were asked
             lean = less_small_faults(work, lean)
         return conclude(work, base, lean)
     except OutOfTime:

@@ -15,6 +15,7 @@ import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects import UNMODELLED
@@ -36,6 +37,7 @@ MOST_STEPS = 200  # of a torque, over its range
 FASTEST_HZ = {False: 20.0, True: 60.0}  # in time: of a torque, of a sensor error
 FEWEST_PERIODS = 2.5  # seen in the data; less is a shape, not a repetition
 LONGER = 0.7  # share of the error that a multiple of a period may leave, or else it is not meant
+REPEATS = 0.1  # share of the response to a wave that straight lines must not take (beside_lines)
 NEVER = 1e-3  # range of a variable, in its unit, below which nothing is learned over it
 Fold = dict[bool, np.ndarray]
 NONE = np.zeros(0)
@@ -221,7 +223,7 @@ class Sketches:
             if best / divisor >= FEWEST_PERIODS / span:
                 longer = self._best_series(effect, best / divisor, span)
                 found = longer if longer.error < LONGER * found.error else found
-        return [found]
+        return [found] if self._repeats(found) else []
 
     def _best_series(self, effect: LearnedEffect, about: float, span: float) -> Term:
         """The series of a frequency within a step of the sweep."""
@@ -261,6 +263,15 @@ class Sketches:
             dict(zip(names, found.tolist(), strict=True)),
             error,
         )
+
+    def _repeats(self, term: Term) -> bool:
+        """Whether motions respond to a series as to one, and not as to a few straight lines."""
+        variables = [self._variable(term.effect, piece) for piece in self.pieces]
+        values = {**term.fixed, **term.start}
+        waves = [np.asarray(term.effect.law(ca.DM(s), values)).ravel() for s in variables]
+        recordings = [self.data_sets[piece.record].recording for piece in self.pieces]
+        share = beside_lines(self._responses(term.effect), variables, waves, recordings)
+        return share > REPEATS
 
     def _vibrating(self, effect: LearnedEffect, span: float) -> list[Term]:
         frequencies = self._frequencies(effect, span)
@@ -423,6 +434,34 @@ class Sketches:
     def _left(self, h: Fold, g: Fold, x: np.ndarray, side: bool) -> np.ndarray:
         curved = np.matmul(h[side], x[:, :, None])[..., 0]
         return self.squares[side] + ((curved - 2 * g[side]) * x).sum(axis=1)
+
+
+def beside_lines(
+    responses: Sequence[Response],
+    variables: Sequence[np.ndarray],
+    functions: Sequence[np.ndarray],
+    recordings: Sequence[str],
+) -> float:
+    """Share of the response to a function that no straight line in each recording takes, 0 to 1.
+
+    Of a wave that passes faster than a motion can follow its mean is all that acts, and through
+    two values of its variable there is a line.
+
+    Args:
+        responses: Of each piece, to a forcing where the function acts.
+        variables: Of each piece, what the function follows, shape (instants,).
+        functions: Of each piece, the function, shape (instants,).
+        recordings: Of each piece, the recording that it is cut from.
+    """
+    powers: dict[str, np.ndarray] = {}
+    for response, s, g, name in zip(responses, variables, functions, recordings, strict=True):
+        together = response.among(np.column_stack([g, np.ones(len(g)), s]))
+        powers[name] = powers.get(name, 0.0) + together
+    left = [
+        p[0, 0] - p[0, 1:] @ np.linalg.pinv(p[1:, 1:], hermitian=True) @ p[1:, 0]
+        for p in powers.values()
+    ]
+    return float(sum(left) / max(sum(p[0, 0] for p in powers.values()), 1e-300))
 
 
 def _waves(s: np.ndarray, frequencies: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from cg_sysid.errors import Failure
 from cg_sysid.identification import along_motion, torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit, fit, predict, score, unknowns_of
+from cg_sysid.identification.torque_error import TorqueFit
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns, unsettled_states
 from cg_sysid.search import excerpt as excerpt
 from cg_sysid.search import settings
@@ -61,6 +62,7 @@ class Task:
         first: Fit of the base to an excerpt of the records, for looks in the same way.
         reach: chi2/N that matters: fits that lie beyond and gain little are broken off.
         rival: What has states and has to come up to this.
+        torques: What the torques say of the effect from each of its starts (`torque_fits`).
     """
 
     model: Model
@@ -74,6 +76,7 @@ class Task:
     first: Fit | None = None
     reach: float = np.inf
     rival: Rival | None = None
+    torques: tuple[TorqueFit, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -689,33 +692,19 @@ def _by_torque(
     if any(start is not None for _, start in starts) or not torque_error.can(models[0]):
         return led
     few = [train[i] for i in excerpt.few(train)]
-    # From where the base stands it is not far.
-    known = task.first or task.base
-    at = {u.name: v for u, v in zip(known.unknowns, known.values, strict=True)} if known else {}
     tried = effect_of(task)
-    # Along a motion a simulation goes with each step. Those of the base are made once: their
-    # numbers stay.
-    followed = 2 * settings.SCREENING.followed if tried and tried.states else None
-    settled = tuple(
-        f'{e.label}.' for e in task.model.effects
-        if along_motion.follows(e) and (tried is None or e.label != tried.label)
-    )  # fmt: skip
-    if settled:
-        unknowns = unknowns_of(models[0], only, task.bounds)
-        only = [u.name for u in unknowns if not u.name.startswith(settled)]
     beaten, rival = np.inf, task.rival
     if rival is not None and tried is not None and along_motion.follows(tried):
         by_torque = torque_error.fits_by_torque(
             [rival.model], few, None, rival.bounds, at=rival.at, quick=True
         )
         beaten = min((f.deviance for f in by_torque), default=np.inf) + settings.SCREENING.clearly
-    found = torque_error.fits_by_torque(
-        models, few, only, task.bounds, at=at, followed=followed, beaten=beaten
-    )
+    found = task.torques or _fits_by_torque(task, models, few, only, beaten)
     if not found:
         return led
     if min(f.deviance for f in found) > beaten:
         raise RuledOut
+    at = _known(task)
     led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led
@@ -731,6 +720,52 @@ def _by_torque(
     # A look at a law without states is short: torques need not choose among a few starts of it.
     many = bool(tried.states) or any(p.swept for p in tried.parameters)
     return [led[k] for k in (told[: settings.SCREENING.followed] if many else told)]
+
+
+def torque_fits(task: Task, train: Sequence[DataSet]) -> tuple[TorqueFit, ...]:
+    """What the torques say of an effect whose states they move, from each of its starts.
+
+    Returns:
+        A fit by torque error of each start; none where there is no such effect, or no look.
+    """
+    task, tried = _as_cause(task), effect_of(task)
+    if tried is None or not along_motion.follows(tried) or not torque_error.can(task.model):
+        return ()
+    few = [train[i] for i in excerpt.few(train)]
+    models = list(_starting_models(task, train))
+    try:
+        return tuple(_fits_by_torque(task, models, few, None, np.inf))
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return ()
+
+
+def _fits_by_torque(
+    task: Task,
+    models: Sequence[Model],
+    few: Sequence[DataSet],
+    only: Sequence[str] | None,
+    beaten: float,
+) -> list[TorqueFit]:
+    """Of each start; along a motion a simulation goes with each step."""
+    tried = effect_of(task)
+    followed = 2 * settings.SCREENING.followed if tried and tried.states else None
+    # What moves by itself in the base is simulated once: its numbers stay.
+    settled = tuple(
+        f'{e.label}.' for e in task.model.effects
+        if along_motion.follows(e) and (tried is None or e.label != tried.label)
+    )  # fmt: skip
+    if settled:
+        unknowns = unknowns_of(models[0], only, task.bounds)
+        only = [u.name for u in unknowns if not u.name.startswith(settled)]
+    return torque_error.fits_by_torque(
+        models, few, only, task.bounds, at=_known(task), followed=followed, beaten=beaten
+    )
+
+
+def _known(task: Task) -> dict[str, float]:
+    """Where the base stands: from there it is not far."""
+    known = task.first or task.base
+    return _numbers(known) if known else {}
 
 
 def _starting_models(task: Task, train: Sequence[DataSet] = ()) -> Iterator[Model]:

@@ -26,7 +26,7 @@ class Screening:
         same: Ratio of the errors of two fits that may be one minimum.
         alike: Relative difference of an effect's parameters there.
         clearly: Deviance (-2 log likelihood) of the torques by which what has states, as a rotor,
-            is not simulated where it is worse than its rival.
+            is not simulated where it is worse than its rival, or waits where another is better.
     """
 
     lengths_s: tuple[float, ...] = (2.0, 5.0)

@@ -1,6 +1,7 @@
 """Successive halving: who is fitted on top of one model, in what order, and how far.
 
-    first look (excerpt.py), the light ones before the heavy
+    first look (excerpt.py), the light ones before the heavy, and of these first those that the
+    torques of a robot speak for
       -> those that look best are fitted to whole records, then all others within reach,
          each time the light ones first
       -> ever longer fits of those that may still win
@@ -20,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.errors import Failure
+from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.parallel import CarryOut
@@ -36,6 +38,7 @@ from cg_sysid.search.candidates import (
     led_on,
     rival_of,
     screen,
+    torque_fits,
     try_candidate,
 )
 from cg_sysid.search.events import undisturbed
@@ -173,6 +176,9 @@ class SuccessiveHalving:
         heavy = [replace(task, reach=reach) for task in others if _is_heavy(task)]
         if base.rival is None and ahead and _leaves_little(ahead, base.first):
             heavy = [replace(task, rival=rival_of(ahead)) for task in heavy]
+        waiting: list[Task] = []
+        if not by_belief:
+            heavy, waiting = self._spoken_for(heavy, f'what torques say of {what}')
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
@@ -184,6 +190,65 @@ class SuccessiveHalving:
             return list(self._fitted(tasks, what).values()), [
                 *aside, *(s.label for s in screenings if s.label not in tried),
             ]  # fmt: skip
+        found = self._worth_a_fit(screenings, found, tried, base, beaten, earned, what)
+        if waiting and np.isinf(_clear(_best(found), base.base)):
+            # Who was spoken for explains little: it was none of these.
+            screenings += self.screen(_longest_first(waiting), looking)
+            found = self._worth_a_fit(screenings, found, tried, base, beaten, earned, what)
+            waiting = []
+        aside += [effect.label for task in waiting if (effect := effect_of(task)) is not None]
+        # To seek events in every record takes long: first what explains most of the error.
+        # In records held out, too: something may have happened there and in no other.
+        before = _error(base.base)
+        if beaten > _most_of(before) and not any(
+            o.train.normalised_error <= _most_of(before)
+            and o.held.normalised_error <= _most_of(judged)
+            for o in found.values()
+        ):
+            found |= self._fitted(events, f'{what}, events')
+        found |= self._in_more_depth(found, base.base, beaten, earned, what)
+        return list(found.values()), [
+            *aside, *(s.label for s in screenings if s.label not in tried),
+        ]  # fmt: skip
+
+    def _spoken_for(self, tasks: Sequence[Task], what: str) -> tuple[list[Task], list[Task]]:
+        """Those that the torques speak for or know nothing of, and those that can wait.
+
+        Of what moves by itself the torques say in seconds what a look takes half a minute for.
+        What they explain far worse than another is not there, or shows when that one stands.
+        """
+        new = [
+            task for task in tasks
+            if task.rival is None and torque_error.can(task.model)
+            and _structure(task) not in self.screenings and self._known_beside(task) is None
+        ]  # fmt: skip
+        if not new:
+            return list(tasks), []
+        said = self.carry_out(torque_fits, [(task, self.train) for task in new], what)
+        told = {
+            _structure(task): replace(task, torques=fits)
+            for task, fits in zip(new, said, strict=True)
+        }
+        tasks = [told.get(_structure(task), task) for task in tasks]
+        limit = min(map(_deviance, tasks), default=np.inf) + settings.SCREENING.clearly
+        waiting = [task for task in tasks if task.torques and _deviance(task) > limit]
+        return [task for task in tasks if task not in waiting], waiting
+
+    def _worth_a_fit(
+        self,
+        screenings: Sequence[Screening],
+        found: Mapping[str, Outcome],
+        tried: set[str],
+        base: Task,
+        beaten: float,
+        earned: float,
+        what: str,
+    ) -> dict[str, Outcome]:
+        """Fits to whole records of looks within reach, the best and the lightest first.
+
+        To those found are added what else is worth it, and to those tried their labels.
+        """
+        found = dict(found)
         favoured = _favoured(_smallest(screenings))
         for limit, of_heavy in itertools.product((favoured, np.inf), (False, True)):
             best = _best(found)
@@ -203,19 +268,7 @@ class SuccessiveHalving:
             found |= self._fitted(
                 [replace(screening.task, reach=reach) for screening in heat], what
             )
-        # To seek events in every record takes long: first what explains most of the error.
-        # In records held out, too: something may have happened there and in no other.
-        before = _error(base.base)
-        if beaten > _most_of(before) and not any(
-            o.train.normalised_error <= _most_of(before)
-            and o.held.normalised_error <= _most_of(judged)
-            for o in found.values()
-        ):
-            found |= self._fitted(events, f'{what}, events')
-        found |= self._in_more_depth(found, base.base, beaten, earned, what)
-        return list(found.values()), [
-            screening.label for screening in screenings if screening.label not in tried
-        ]
+        return found
 
     def _in_more_depth(
         self,
@@ -329,6 +382,11 @@ def _light(tasks: Iterable[Task]) -> list[Task]:
 def _is_heavy(task: Task) -> bool:
     """Whether it waits for the light ones: what those come to shows how far it may go."""
     return cost_of(task) >= settings.HALVING.heavy
+
+
+def _deviance(task: Task) -> float:
+    """What torques leave with the best start of an effect; infinite where they say nothing."""
+    return min((said.deviance for said in task.torques), default=np.inf)
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
