@@ -268,7 +268,8 @@ class Sketches:
         """Whether motions respond to a series as to one, and not as to a few straight lines."""
         variables = [self._variable(term.effect, piece) for piece in self.pieces]
         values = {**term.fixed, **term.start}
-        waves = [np.asarray(term.effect.law(ca.DM(s), values)).ravel() for s in variables]
+        laws = (term.effect.law(ca.SX(s), values) for s in variables)
+        waves = [np.asarray(ca.DM(g)).ravel() for g in laws]
         recordings = [self.data_sets[piece.record].recording for piece in self.pieces]
         share = beside_lines(self._responses(term.effect), variables, waves, recordings)
         return share > REPEATS
