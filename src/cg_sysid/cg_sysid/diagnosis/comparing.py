@@ -127,7 +127,8 @@ def led_deeper(
         )
         if warm_start is None:
             break
-        task = replace(task_alone, warm_starts=(warm_start,), base=None)
+        reach = base.train.normalised_error
+        task = replace(task_alone, warm_starts=(warm_start,), base=None, reach=reach)
         deeper = work.halving.fit([task], f'{title_of(work.added(base))}, deeper')[0]
         if isinstance(deeper, Failure) or settings.SCREENING.same * chi2(deeper) > chi2(base):
             break

@@ -153,7 +153,8 @@ def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:
 
 def _if_better(work: Workspace, o: Outcome, task: Task, how: str) -> Outcome:
     """What a task comes to, as thorough as the outcome is, if that leaves less than it."""
-    task = replace(task, thorough=o.task.thorough, iterations=o.task.iterations)
+    reach = o.train.normalised_error
+    task = replace(task, thorough=o.task.thorough, iterations=o.task.iterations, reach=reach)
     found = work.halving.fit([task], f'{title_of(work.added(o))}, {how}')[0]
     if not isinstance(found, Outcome) or chi2(found) >= chi2(o):
         return o
