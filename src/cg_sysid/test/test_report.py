@@ -82,6 +82,10 @@ def test_what_is_not_determined_is_said_beside_the_cause(facts, lines):
     made = with_verdict(facts, 'explained')
     made['causes'][0]['undetermined'] = ['bias']
     assert said in render(made, lines)
+    made['causes'][0] |= {'undetermined': [], 'at_edge': ['bias']}
+    assert 'The fit drove bias to the edge of what was tried: what acts like this' in render(
+        made, lines
+    )
 
 
 def test_causes_that_explain_little_are_not_called_the_cause(facts, lines):

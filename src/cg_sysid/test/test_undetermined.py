@@ -62,6 +62,13 @@ def test_the_summary_says_so():
     )
 
 
+def test_the_summary_says_where_a_number_ended_at_an_edge():
+    cause = Cause('cogging_torque', {'cycles': (1.0, 0.1, '1')}, 900.0, at_edge=('cycles',))
+    gain = Gain('hip_angle', 'rad', 1e-4, 0.02, 0.001)
+    said = summary_of('explained', [cause], (gain,), {})
+    assert 'The fit drove cogging_torque.cycles to the edge of what was tried: what acts' in said
+
+
 def test_a_size_that_is_not_determined_is_no_cause(nominal):
     """A motor that gives 1 N m and another loss: a limit explains nothing, whatever it gains."""
     machine = nominal.with_effect('quadratic_friction', coefficient=0.05)

@@ -19,6 +19,7 @@ from cg_sysid.search.candidates import (
     Outcome,
     events_in,
     events_of,
+    parameters_at_edge,
     parameters_of,
     shared_parameters,
 )
@@ -98,6 +99,7 @@ def as_in(final: Outcome, cause: Cause) -> Cause:
         parameters=parameters_of(final, cause.label),
         events=events_of(final, cause.label),
         undetermined=_undetermined(final.train, cause.label),
+        at_edge=tuple(parameters_at_edge(replace(final, label=cause.label))),
         replaces=tuple(e.label for e in final.model.effects if _idle(final, cause.label, e.label)),
     )  # fmt: skip
 

@@ -58,10 +58,11 @@ def _consistent(facts: Mapping[str, Any]) -> str:
 
 def _explained(facts: Mapping[str, Any]) -> str:
     use = 'Simulate with model.yaml, which has the causes in it.'
-    if any(cause['undetermined'] for cause in facts['causes']):
+    if any(cause['undetermined'] or cause.get('at_edge') for cause in facts['causes']):
         use = (
             'Simulate with model.yaml for motions like these only: some of its numbers are not '
-            'determined. Record faster and larger motions next.'
+            'determined, or ended at the edge of what was tried. Record faster and larger motions '
+            'next.'
         )
     return f'{use} {_look(facts)}'
 

@@ -53,6 +53,7 @@ class Cause:
         places: Labels of the same effect at other places that explain the records as well.
         proposals: Experiments that would tell it from its rivals, best first.
         undetermined: Parameters of which the records do not even tell the order.
+        at_edge: Parameters that ended at an edge of their range where physics goes on.
         replaces: Labels of simpler effects of the nominal model that it makes idle.
         events: What happened in single records: record -> parameter -> (value, standard
             deviation, unit).
@@ -66,6 +67,7 @@ class Cause:
     events: Mapping[str, Mapping[str, tuple[float, float, str]]] = field(default_factory=dict)
     proposals: tuple[Proposal, ...] = ()
     undetermined: tuple[str, ...] = ()
+    at_edge: tuple[str, ...] = ()
     replaces: tuple[str, ...] = ()
 
 

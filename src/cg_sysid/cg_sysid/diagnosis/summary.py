@@ -11,7 +11,7 @@ from cg_sysid.identification.gain import NO_GAIN, Gain
 from cg_sysid.learned.unmodelled import NOTHING, Unmodelled
 from cg_sysid.search import settings
 from cg_sysid.search.ranking import effect_name
-from cg_sysid.text import listed, measured, number
+from cg_sysid.text import listed, measured, number, sentence
 
 INTERVAL = 1.96  # standard deviations on either side of a 95 % interval
 MOST_TOLD = 3  # events of single records in the summary
@@ -89,12 +89,7 @@ def summary_of(
             f'{biggest.channel} falls from {biggest.before:.3g} to {biggest.after:.3g} '
             f'{biggest.unit} (noise {biggest.noise:.2g}).'
         )
-    vague = [f'{c.label}.{name}' for c in causes for name in c.undetermined]
-    if vague:
-        text += (
-            f' These records do not determine {" and ".join(vague)}: what acts like this need '
-            'not be what it is named after.'
-        )
+    text += _what_need_not_be(causes)
     best = next((c.proposals[0] for c in causes if c.proposals), None)
     if best is not None and best.evidence > settings.SELECTION.margin:
         text += (
@@ -111,6 +106,24 @@ def summary_of(
         text += f' {unmodelled.text}' if unmodelled else ''
         text += f' {wandering.text}' if wandering else ''
     return text
+
+
+def _what_need_not_be(causes: Sequence[Cause]) -> str:
+    """That causes may act like what they are named after, and be something else."""
+    vague = [f'{c.label}.{name}' for c in causes for name in c.undetermined]
+    ended = [
+        f'{c.label}.{name}' for c in causes for name in c.at_edge if name not in c.undetermined
+    ]
+    reasons = []
+    if vague:
+        reasons.append(f'these records do not determine {listed(vague)}')
+    if ended:
+        reasons.append(f'the fit drove {listed(ended)} to the edge of what was tried')
+    if not reasons:
+        return ''
+    return (
+        f' {sentence("; ".join(reasons))}: what acts like this need not be what it is named after.'
+    )
 
 
 def described(cause: Cause) -> str:

@@ -272,6 +272,7 @@ def _cause(cause: Cause, model: Model) -> Facts:
         **_effect(cause.label),
         'parameters': _values(cause.parameters, cause.label, ranges),
         'undetermined': list(cause.undetermined),
+        'at_edge': list(cause.at_edge),
         'replaces': list(cause.replaces),
         'evidence_nats': cause.evidence,
         'rivals': [_effect(rival) for rival in cause.rivals],

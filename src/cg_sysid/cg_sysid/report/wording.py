@@ -194,14 +194,20 @@ def replaced_words(cause: Facts) -> list[str]:
 
 
 def undetermined_words(cause: Facts) -> list[str]:
-    """That the records do not determine some of its parameters, in at most one sentence."""
-    names = [name.replace('_', ' ') for name in cause.get('undetermined', ())]
-    if not names:
+    """That some of its parameters say that it may be something else, in at most one sentence."""
+    vague, ended = (cause.get(which, ()) for which in ('undetermined', 'at_edge'))
+    reasons = []
+    if vague:
+        reasons.append(f'these recordings do not determine {_names(vague)}')
+    if ended := [name for name in ended if name not in vague]:
+        reasons.append(f'the fit drove {_names(ended)} to the edge of what was tried')
+    if not reasons:
         return []
-    return [
-        f'these recordings do not determine {" and ".join(names)}: what acts like this need not '
-        'be what it is named after'
-    ]
+    return [f'{"; ".join(reasons)}: what acts like this need not be what it is named after']
+
+
+def _names(parameters: list[str]) -> str:
+    return ' and '.join(name.replace('_', ' ') for name in parameters)
 
 
 def parameter_words(parameters: Facts) -> list[str]:

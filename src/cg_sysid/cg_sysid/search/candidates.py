@@ -947,12 +947,20 @@ def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
 
 
 def at_edge(o: Outcome) -> list[str]:
-    """A parameter at the edge of its range says that the effect is not what is meant.
+    """That a parameter at the edge of its range says that the effect is not what is meant."""
+    return [
+        f'{o.label}.{name} = {measured(value, None, unit)} lies at the edge of its range'
+        for name, (value, unit) in parameters_at_edge(o).items()
+    ]
+
+
+def parameters_at_edge(o: Outcome) -> dict[str, tuple[float, str]]:
+    """Those of an outcome's effect, with value and unit.
 
     But for a part of an effect that may well be absent: the edge is where it vanishes; and where
     physics ends with the range.
     """
-    found = []
+    found = {}
     declared = _declared_by(o)
     optional = {f'{o.label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
     ends = {f'{o.label}.{p.name}': p.ends for p in declared}
@@ -971,5 +979,5 @@ def at_edge(o: Outcome) -> list[str]:
         below = low + margin if u.name not in optional and 'lower' not in physical else -np.inf
         above = high - margin if 'upper' not in physical else np.inf
         if not below < at < above:
-            found.append(f'{u.name} = {measured(v, None, u.unit)} lies at the edge of its range')
+            found[u.name.removeprefix(f'{o.label}.')] = float(v), u.unit
     return found
