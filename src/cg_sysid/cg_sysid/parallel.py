@@ -1,7 +1,8 @@
 """Independent pieces of work on the cores of this machine, results in order.
 
 Many pieces go to processes. One alone stays in this process and has all cores for itself: what it
-does record by record goes to threads, as compiled simulations run beside Python.
+does record by record goes to threads, as compiled simulations run beside Python. So has the last
+of many, when the processes beside it have no work any more.
 
 Where the thread that waits keeps a deadline (deadline.py), it waits no longer than that.
 """
@@ -80,8 +81,11 @@ def run_all(
         results = [_with_threads(cores, function, *arguments[0])]
         progress(1, 1, results[0])
         return results
-    pool = executor or _local(workers, function.__module__ == '__main__')
-    futures = [pool.submit(function, *a) for a in arguments]
+    if executor is not None:
+        futures = [executor.submit(function, *a) for a in arguments]
+    else:
+        pool = _local(workers, function.__module__ == '__main__')
+        futures = [pool.submit(_in_company, function, *a) for a in arguments]
     try:
         for done, future in enumerate(_in_time(futures), start=1):
             progress(done, total, future.result())
@@ -113,7 +117,7 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterab
         function: Spends its time outside Python and changes nothing that another call reads.
         items: What for.
     """
-    threads = _threads.get()
+    threads = _threads.get() or (_company.threads() if _company else None)
     return map(function, items) if threads is None else threads.map(function, items)
 
 
@@ -124,6 +128,41 @@ def _with_threads(cores: int, function: Callable[..., Any], *arguments: Any) -> 
             return function(*arguments)
         finally:
             _threads.reset(token)
+
+
+class _Company:
+    """What a process of a pool knows of the others.
+
+    Args:
+        busy: Processes with a piece of work.
+        processes: All of them, one a core.
+    """
+
+    def __init__(self, busy: Any, processes: int):
+        self.busy, self.processes = busy, processes
+        self._threads: ThreadPoolExecutor | None = None
+
+    def threads(self) -> ThreadPoolExecutor | None:
+        """Threads for all cores where no other process has work; else none."""
+        if self.processes < 2 or self.busy.value > 1:
+            return None
+        self._threads = self._threads or ThreadPoolExecutor(self.processes)
+        return self._threads
+
+
+_company: _Company | None = None  # of a process of the pool
+
+
+def _in_company(function: Callable[..., Any], *arguments: Any) -> Any:
+    """function(*arguments) in a process of the pool, counted among those with work."""
+    assert _company is not None
+    with _company.busy.get_lock():
+        _company.busy.value += 1
+    try:
+        return function(*arguments)
+    finally:
+        with _company.busy.get_lock():
+            _company.busy.value -= 1
 
 
 class _Process(multiprocessing.context.SpawnProcess):
@@ -163,10 +202,13 @@ def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
         _knows_script = script
         for library in ('OPENBLAS', 'OMP', 'MKL'):
             os.environ.setdefault(f'{library}_NUM_THREADS', '1')
+        context = multiprocessing.get_context('spawn') if script else _Modules()
+        processes = workers or os.cpu_count() or 1
         _pool = ProcessPoolExecutor(
-            workers or os.cpu_count(),
-            mp_context=multiprocessing.get_context('spawn') if script else _Modules(),
+            processes,
+            mp_context=context,
             initializer=_as_worker,
+            initargs=(context.Value('i', 0), processes),
         )
         # A process that multiprocessing started waits for its own processes before Python ends
         # their pool: it would wait for ever.
@@ -174,7 +216,9 @@ def _local(workers: int | None, script: bool = False) -> ProcessPoolExecutor:
     return _pool
 
 
-def _as_worker() -> None:
+def _as_worker(busy: Any, processes: int) -> None:
+    global _company
+    _company = _Company(busy, processes)
     # Ctrl-C reaches every process of the terminal; the one that was started answers for all.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_spawner()

@@ -1,6 +1,7 @@
 """One piece of work alone has all cores; what it comes to is the same to the bit."""
 
 import math
+import multiprocessing
 import subprocess
 import sys
 import threading
@@ -12,6 +13,7 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid import parallel
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
@@ -37,6 +39,40 @@ def test_one_piece_alone_has_all_cores():
     before = threading.active_count()
     assert run_all(_meet, [(2,)], workers=2) == [[True, True]]
     assert threading.active_count() == before
+
+
+# The last piece waits until two of its calls are under way at the same time.
+LAST = """
+from cg_sysid.parallel import run_all, side_by_side
+import threading
+import time
+def meet(seconds):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        together = threading.Barrier(2)
+        def wait(_):
+            try:
+                return together.wait(timeout=0.05) >= 0
+            except threading.BrokenBarrierError:
+                return False
+        if all(list(side_by_side(wait, range(2)))):
+            return True
+    return False
+if __name__ == '__main__':
+    print(run_all(meet, [(0.0,), (50.0,)], workers=2))
+"""
+
+
+def test_the_last_piece_has_the_cores_of_those_that_are_done(tmp_path):
+    assert _said_by(LAST, tmp_path) == '[False, True]\n'
+
+
+def test_a_piece_beside_others_has_one_core():
+    company = parallel._Company(multiprocessing.Value('i', 2), 2)
+    assert company.threads() is None
+    company.busy.value = 1
+    assert company.threads() is company.threads() is not None
+    assert parallel._Company(company.busy, 1).threads() is None
 
 
 def test_results_come_in_order_and_errors_through():
@@ -88,12 +124,18 @@ if __name__ == '__main__':
 def test_a_script_needs_no_guard_and_may_have_functions_and_processes_of_its_own(
     text, said, tmp_path
 ):
-    (tmp_path / 'script.py').write_text(text)
+    assert _said_by(text, tmp_path) == said
+
+
+def _said_by(text, folder):
+    """What a script prints; it has to end well."""
+    (folder / 'script.py').write_text(text)
     done = subprocess.run(
-        [sys.executable, 'script.py'], cwd=tmp_path, capture_output=True, text=True,
+        [sys.executable, 'script.py'], cwd=folder, capture_output=True, text=True,
         timeout=60, check=False,
     )  # fmt: skip
-    assert (done.stdout, done.returncode) == (said, 0), done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_progress_hears_of_every_result_as_it_comes():
