@@ -123,6 +123,23 @@ def test_the_cause_is_worth_a_look(believed, name, at, sizes):
     assert len(kept) < len(candidates) / 2
 
 
+def test_what_moves_by_itself_is_sought_where_a_simulation_misses_most(believed):
+    # Plain friction of the hip takes most torque; play in a light shank shows in its motion only.
+    train = data(believed.with_values(OFF), believed)
+    candidates = candidates_for(believed, [Setup()])
+    joints = believed.mechanism.coordinates
+    plain = scores(believed, train, candidates, {})
+    last = plain.worst[-1]
+    found = scores(
+        believed, train, candidates, {},
+        missed={f'{joint}_position': 9.0 if joint == last else 2.0 for joint in joints},
+    )  # fmt: skip
+    assert found.worst[:2] == (plain.worst[0], last)
+    assert set(found.worst) == set(joints)
+    assert ('backlash', last) not in plain.worth(candidates)
+    assert ('backlash', last) in found.worth(candidates)
+
+
 @pytest.mark.parametrize('link', ['hip', 'thigh', 'shank'])
 def test_a_push_is_worth_a_look_on_the_link_that_it_is_on(believed, link):
     true = believed.with_values(OFF)

@@ -21,6 +21,7 @@ from cg_sysid.search.candidates import (
 )
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import SOUND_LAWS, nuisances
+from cg_sysid.search.ranking import per_output
 from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
 from cg_sysid.search.torque_screening import KEPT, scores
@@ -88,7 +89,10 @@ def worth_a_look(work: Workspace, base: Outcome, idle: Effects = ()) -> Effects:
         return effects
     said = work.torques.get(key)
     if key not in work.torques:
-        said = scores(base.model, work.train, effects, base.task.bounds, work.carry_out, work.held)
+        missed = dict(zip(base.model.mechanism.outputs, per_output(base.train), strict=True))
+        said = scores(
+            base.model, work.train, effects, base.task.bounds, work.carry_out, work.held, missed
+        )
         if not idle:
             work.torques[key] = said
     return effects if said is None else said.worth(effects)
