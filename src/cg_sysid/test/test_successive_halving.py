@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import finger
+import hanging_arm
 import numpy as np
 import pytest
 
@@ -349,6 +350,21 @@ def test_a_rotor_that_torques_speak_less_for_waits(behind, left, looked_at, wait
     assert sorted(looks) == looked_at
     assert {o.label for o in found} == set(looked_at)
     assert bool(aside) == waits
+
+
+@pytest.mark.parametrize(('missed', 'first'), [(41.0, 1), (39.0, 3)])
+def test_what_moves_by_itself_is_looked_at_on_the_joint_that_stands_out(missed, first):
+    robot = hanging_arm.nominal()
+    train = prepare(robot, [hanging_arm.recorded(robot, 1.0, 1)])
+    found = fit(robot, train, iterations=1)
+    # What is left of hip, thigh and shank: four times as much of the shank, or nearly so.
+    base = Task(robot, base=replace(found, mse=np.array([[10.0, 2.0, missed]])))
+    tasks = [replace(base, effect=('backlash', joint)) for joint in robot.mechanism.coordinates]
+    halving = SuccessiveHalving(train, train, lambda _, arguments, what: [()] * len(arguments))
+    looked_at, waiting = halving._spoken_for(tasks, base, 'race')
+    assert len(looked_at) == first
+    assert ('backlash', 'shank_joint') in {task.effect for task in looked_at}
+    assert len(looked_at) + len(waiting) == len(tasks)
 
 
 @pytest.mark.parametrize(('left', 'deeper'), [(42.0, False), (40.0, True)])

@@ -109,6 +109,8 @@ class Halving:
         belief: Times what beliefs cost the base, that a fit that is not at its end may be off.
         heavy: Cost from which a candidate is looked at when the others have been.
         first_few: Light candidates that may show that the base was in a local minimum.
+        stands_out: Ratio of the errors of two joints' motions, from which what moves by itself is
+            looked at on the worse of them before all others.
         fewest: Light candidates that are fitted to whole records whatever the first look says.
     """
 
@@ -123,6 +125,7 @@ class Halving:
     belief: float = 3.0
     heavy: int = 10
     first_few: int = 8
+    stands_out: float = 4.0
     fewest: int = 5
 
 

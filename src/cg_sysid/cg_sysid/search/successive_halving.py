@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.errors import Failure
-from cg_sysid.identification import torque_error
+from cg_sysid.identification import along_motion, torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.identify import Fit
 from cg_sysid.parallel import CarryOut
@@ -44,6 +44,7 @@ from cg_sysid.search.candidates import (
 from cg_sysid.search.events import undisturbed
 from cg_sysid.search.model_selection import samples
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.ranking import per_output
 
 log = logging.getLogger(__name__)
 
@@ -178,7 +179,7 @@ class SuccessiveHalving:
             heavy = [replace(task, rival=rival_of(ahead)) for task in heavy]
         waiting: list[Task] = []
         if not by_belief:
-            heavy, waiting = self._spoken_for(heavy, f'what torques say of {what}')
+            heavy, waiting = self._spoken_for(heavy, base, f'what torques say of {what}')
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
         if by_belief:
@@ -211,19 +212,25 @@ class SuccessiveHalving:
             *aside, *(s.label for s in screenings if s.label not in tried),
         ]  # fmt: skip
 
-    def _spoken_for(self, tasks: Sequence[Task], what: str) -> tuple[list[Task], list[Task]]:
-        """Those that the torques speak for or know nothing of, and those that can wait.
+    def _spoken_for(
+        self, tasks: Sequence[Task], base: Task, what: str
+    ) -> tuple[list[Task], list[Task]]:
+        """Those that motion and torques speak for or know nothing of, and those that can wait.
 
-        Of what moves by itself the torques say in seconds what a look takes half a minute for.
-        What they explain far worse than another is not there, or shows when that one stands.
+        What moves by itself moves its own joint most. Of what acts there the torques say in
+        seconds what a look takes half a minute for. What they explain far worse than another is
+        not there, or shows when that one stands.
         """
+        if base.base is None or not torque_error.can(base.model):
+            return list(tasks), []
+        joint = _standing_out(base.base)
+        elsewhere = [task for task in tasks if joint is not None and _moves_another(task, joint)]
+        tasks = [task for task in tasks if task not in elsewhere]
         new = [
             task for task in tasks
-            if task.rival is None and torque_error.can(task.model)
-            and _structure(task) not in self.screenings and self._known_beside(task) is None
+            if task.rival is None and _structure(task) not in self.screenings
+            and self._known_beside(task) is None
         ]  # fmt: skip
-        if not new:
-            return list(tasks), []
         said = self.carry_out(torque_fits, [(task, self.train) for task in new], what)
         told = {
             _structure(task): replace(task, torques=fits)
@@ -231,8 +238,8 @@ class SuccessiveHalving:
         }
         tasks = [told.get(_structure(task), task) for task in tasks]
         limit = min(map(_deviance, tasks), default=np.inf) + settings.SCREENING.clearly
-        waiting = [task for task in tasks if task.torques and _deviance(task) > limit]
-        return [task for task in tasks if task not in waiting], waiting
+        worse = [task for task in tasks if task.torques and _deviance(task) > limit]
+        return [task for task in tasks if task not in worse], [*worse, *elsewhere]
 
     def _worth_a_fit(
         self,
@@ -387,6 +394,28 @@ def _is_heavy(task: Task) -> bool:
 def _deviance(task: Task) -> float:
     """What torques leave with the best start of an effect; infinite where they say nothing."""
     return min((said.deviance for said in task.torques), default=np.inf)
+
+
+def _standing_out(found: Fit) -> str | None:
+    """The joint whose motion a fit of a robot misses far more than that of any other, if any."""
+    outputs = found.model.mechanism.outputs
+    missed = sorted(
+        ((float(error), output.removesuffix('_position'))
+         for output, error in zip(outputs, per_output(found), strict=True)
+         if output.endswith('_position')),
+        reverse=True,
+    )  # fmt: skip
+    if len(missed) < 2 or missed[0][0] < settings.HALVING.stands_out * missed[1][0]:
+        return None
+    return missed[0][1]
+
+
+def _moves_another(task: Task, joint: str) -> bool:
+    """Whether what an effect moves by itself is at another joint."""
+    effect = effect_of(task)
+    return (
+        effect is not None and along_motion.follows(effect) and effect.site not in (joint, 'all')
+    )
 
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
