@@ -7,9 +7,11 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from searches import search_for
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -17,11 +19,13 @@ from cg_sysid import parallel
 from cg_sysid.cli import diagnose as diagnose_cli
 from cg_sysid.deadline import Deadline, OutOfTime, check_time
 from cg_sysid.diagnosis.diagnose import Options, diagnose
+from cg_sysid.diagnosis.early_end import answer_so_far
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import identify, kept_fits
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import IdentificationError
+from cg_sysid.search.candidates import Task, try_candidate
 
 EFFECTS = ('torque_bias', 'sensor_delay', 'quadratic_friction')
 MORE = (*EFFECTS, 'payload', 'actuator_lag', 'aerodynamic_drag', 'stribeck_friction')
@@ -150,6 +154,27 @@ def test_what_was_fitted_is_judged(delayed):
     assert any('doubt' in step for step in found.unfinished.steps)
     hip = next(gain for gain in found.gains if gain.channel == 'hip_angle')
     assert hip.after < 0.5 * hip.before
+
+
+def test_a_trial_without_small_faults_is_no_answer_where_it_leaves_more(model_file):
+    """Causes are asked whether they do without them; until then they are as they were found."""
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('torque_constant', error=0.1).with_effect('gyro_bias', bias=0.02)
+    work = search_for(nominal, machine)
+    alone = try_candidate(Task(nominal), work.train, work.held)
+    lean = try_candidate(Task(nominal, ('torque_constant', None)), work.train, work.held)
+    rich = try_candidate(Task(lean.model, ('gyro_bias', None)), work.train, work.held)
+    bounds = {'gyro_bias.bias': 0.01}
+    found = replace(rich, label=lean.label, task=replace(rich.task, bounds=bounds))
+    work.found, work.under_way = found, lean
+    work.so_far.note(lean)
+    answer = answer_so_far(work, alone)
+    assert [c.label for c in answer.causes] == ['torque_constant']
+    assert answer.extended.held.normalised_error == found.held.normalised_error
+    # Who leaves less is the answer.
+    work.found, work.under_way = lean, found
+    answer = answer_so_far(work, alone)
+    assert answer.extended.held.normalised_error == found.held.normalised_error
 
 
 def test_without_a_fit_of_the_model_there_is_no_answer(delayed):

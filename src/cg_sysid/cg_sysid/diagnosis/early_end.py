@@ -6,7 +6,7 @@ from cg_sysid.diagnosis.comparing import done
 from cg_sysid.diagnosis.conclude import answer, verdict_of
 from cg_sysid.diagnosis.result import Diagnosis, Verdict
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import Outcome, candidates_for
+from cg_sysid.search.candidates import Outcome, candidates_for, chi2
 from cg_sysid.search.model_selection import share_explained
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.standings import Unfinished
@@ -16,11 +16,15 @@ def answer_so_far(work: Workspace, nominal: Outcome) -> Diagnosis:
     """The best answer before the end, without any fit more."""
     final, comparison = work.found, None
     if work.added(work.under_way) >= work.added(final):
-        final = work.under_way
-        comparison = work.selection.compare(final, work.so_far.fitted(final.task))
-        winner = None if done(work, final) else comparison.winner()
-        work.note(comparison, winner[0].label if winner else '')
-        final = winner[1] if winner else final
+        comparison = work.selection.compare(
+            work.under_way, work.so_far.fitted(work.under_way.task)
+        )
+        winner = None if done(work, work.under_way) else comparison.winner()
+        reached = winner[1] if winner else work.under_way
+        # The same causes may be on trial without the small faults that they are found among.
+        if chi2(reached) <= chi2(final):
+            work.note(comparison, winner[0].label if winner else '')
+            final = reached
     comparisons = [*work.comparisons.values(), *([comparison] if comparison else [])]
     causes = [cause_among(final, label, comparisons) for label in sorted(work.added(final))]
     left = bool(work.left(final))
