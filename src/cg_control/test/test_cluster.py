@@ -21,7 +21,9 @@ from cluster_processes import LONG, Processes
 NEVER = 10_000.0  # s
 
 
-@pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
+@pytest.mark.skipif(
+    compiler() is None, reason='no C compiler: thousands of rollouts would take too long'
+)
 def test_a_tree_that_a_cluster_plans_is_the_same(robot, tmp_path, monkeypatch):
     make_small(monkeypatch)
     here = grow_tree.grow(robot, 'either', 2 * ROUND, 1)

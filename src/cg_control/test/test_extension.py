@@ -80,7 +80,9 @@ def test_a_planner_that_hangs_or_dies_costs_its_state_alone(robot):
                 same(a, b)
 
 
-@pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')
+@pytest.mark.skipif(
+    compiler() is None, reason='no C compiler: thousands of rollouts would take too long'
+)
 def test_a_tree_grows_on_without_the_states_that_were_given_up(robot):
     with Failing(1, {0: (os._exit, 3), 3: (os._exit, 3)}) as failing:
         grower = Grower(

@@ -43,7 +43,7 @@ def planted(swing_up) -> Grower:
 @pytest.fixture(scope='module')
 def grown(swing_up):
     if compiler() is None:
-        pytest.skip('thousands of rollouts')
+        pytest.skip('no C compiler: thousands of rollouts would take too long')
     grower = planted(swing_up)
     for _ in range(16):
         grower.round()

@@ -124,7 +124,7 @@ def test_the_cause_is_worth_a_look(believed, name, at, sizes):
 
 
 def test_what_moves_by_itself_is_sought_where_a_simulation_misses_most(believed):
-    # Plain friction of the hip takes most torque; play in a light shank shows in its motion only.
+    # Said to be missed most is the joint that the torques suspect least.
     train = data(believed.with_values(OFF), believed)
     candidates = candidates_for(believed, [Setup()])
     joints = believed.mechanism.coordinates

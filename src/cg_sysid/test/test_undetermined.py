@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from searches import search_for
 
 from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
+from cg_sysid.diagnosis.causes import as_in
 from cg_sysid.diagnosis.result import Cause
 from cg_sysid.diagnosis.summary import described, summary_of
 from cg_sysid.experiments.rehearsal import rehearse
@@ -60,6 +62,18 @@ def test_the_summary_says_so():
     assert 'do not determine joint_flexibility.stiffness' in summary_of(
         'explained', [cause], (gain,), {}
     )
+
+
+def test_a_cause_knows_which_of_its_numbers_ended_at_an_edge(nominal):
+    label = 'torque_constant'
+    work = search_for(nominal, nominal.with_effect(label, error=0.1))
+    found = try_candidate(Task(nominal, (label, None)), work.train, work.held)
+    assert as_in(found, Cause(label, {}, 900.0)).at_edge == ()
+    place = [u.name for u in found.train.unknowns].index(f'{label}.error')
+    values = found.train.values.copy()
+    values[place] = found.train.unknowns[place].upper
+    ended = replace(found, train=replace(found.train, values=values))
+    assert as_in(ended, Cause(label, {}, 900.0)).at_edge == ('error',)
 
 
 def test_the_summary_says_where_a_number_ended_at_an_edge():

@@ -704,7 +704,7 @@ def _by_torque(
         return led
     if min(f.deviance for f in found) > beaten:
         raise RuledOut
-    at = _known(task)
+    at = _numbers_of_base(task)
     led = [(start, {**at, **fitted.values}) for start, fitted in zip(starts, found, strict=True)]
     if tried is None or tried.place in ('sensor', 'timing'):
         return led
@@ -746,7 +746,10 @@ def _fits_by_torque(
     only: Sequence[str] | None,
     beaten: float,
 ) -> list[TorqueFit]:
-    """Of each start; along a motion a simulation goes with each step."""
+    """What the torques say of each start; of many with states only the best go on.
+
+    Along a motion a simulation goes with each step.
+    """
     tried = effect_of(task)
     followed = 2 * settings.SCREENING.followed if tried and tried.states else None
     # What moves by itself in the base is simulated once: its numbers stay.
@@ -758,11 +761,11 @@ def _fits_by_torque(
         unknowns = unknowns_of(models[0], only, task.bounds)
         only = [u.name for u in unknowns if not u.name.startswith(settled)]
     return torque_error.fits_by_torque(
-        models, few, only, task.bounds, at=_known(task), followed=followed, beaten=beaten
+        models, few, only, task.bounds, at=_numbers_of_base(task), followed=followed, beaten=beaten
     )
 
 
-def _known(task: Task) -> dict[str, float]:
+def _numbers_of_base(task: Task) -> dict[str, float]:
     """Where the base stands: from there it is not far."""
     known = task.first or task.base
     return _numbers(known) if known else {}
