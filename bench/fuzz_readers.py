@@ -63,7 +63,6 @@ from cg_hardware.simulation import read_setup
 from cg_sysid.errors import RecordingError
 from cg_sysid.experiments.catalogue import ExperimentError, experiments_directory, load_experiment
 from cg_sysid.experiments.excitation import CommandFileError, playback
-from cg_sysid.identification.identify import _End
 from cg_sysid.identification.kept_fits import recall
 from cg_sysid.records.bags import load_note, parse_note, read_bag, write_bag
 from cg_sysid.records.importing import import_logs, mapping_folder
@@ -328,7 +327,7 @@ def _read_urdf(path: Path) -> None:
 
 
 def _read_kept(path: Path) -> None:
-    if _End.of(recall(path)) is None:
+    if recall(path) is None:
         raise DocumentError(f'{path}: nothing that is known')
 
 

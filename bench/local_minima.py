@@ -23,14 +23,10 @@ from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import RUNGS, split
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.search.candidates import (
-    Outcome,
-    Screening,
-    Task,
-    own_parameters,
-    screen,
-    try_candidate,
-)
+from cg_sysid.search.look import Screening, screen
+from cg_sysid.search.outcome import Outcome, own_parameters
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 LONG_S, SIX = 20.0, PROGRAMME[:6]
 SIZES = (0.5, 1.0, 2.0)

@@ -35,7 +35,7 @@ from cg_sysid.identification.measured_start import carried, from_measured_angles
 from cg_sysid.identification.windows import Windows, followed, windows_of
 from cg_sysid.records.bags import read_bag
 from cg_sysid.records.importing import import_to_bags
-from cg_sysid.search.candidates import with_priors_of
+from cg_sysid.search.whole_fit import with_priors_of
 from cg_sysid.text import measured
 
 BUDGET = 600.0  # s

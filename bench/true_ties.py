@@ -28,8 +28,10 @@ from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.parallel import run_all
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, chi2, try_candidate
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.outcome import chi2
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -10,7 +10,7 @@ from cg_sysid.identification import along_motion
 from cg_sysid.identification.along_motion import follows
 from cg_sysid.identification.torque_error import fits_by_torque, problems_of
 from cg_sysid.identification.unknowns import unknowns_of
-from cg_sysid.search.candidates import starts_of
+from cg_sysid.search.starts import starts_of
 
 DRIVES = {
     'joint_flexibility': {'stiffness': 0.06, 'rotor_inertia': 3e-5, 'damping': 4e-4},

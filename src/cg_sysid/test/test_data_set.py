@@ -13,8 +13,10 @@ from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
-from cg_sysid.search.candidates import Task, candidates_for, events_of, try_candidate
 from cg_sysid.search.nuisance import turning
+from cg_sysid.search.outcome import events_of
+from cg_sysid.search.task import Task, candidates_for
+from cg_sysid.search.whole_fit import try_candidate
 
 
 def test_model_gets_torque_time_and_switches_in_its_order(model_file):

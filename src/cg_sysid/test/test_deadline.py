@@ -25,7 +25,8 @@ from cg_sysid.identification import identify, kept_fits
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import IdentificationError
-from cg_sysid.search.candidates import Task, try_candidate
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 EFFECTS = ('torque_bias', 'sensor_delay', 'quadratic_friction')
 MORE = (*EFFECTS, 'payload', 'actuator_lag', 'aerodynamic_drag', 'stribeck_friction')

@@ -12,10 +12,12 @@ from cg_sysid.diagnosis import comparing, doubt, forward
 from cg_sysid.diagnosis.comparing import done, less_shapes
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Screening, Task, try_candidate
+from cg_sysid.search.look import Screening
 from cg_sysid.search.model_selection import Comparison, above_noise
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.task import Task
 from cg_sysid.search.torque_screening import Scores
+from cg_sysid.search.whole_fit import try_candidate
 
 OWN, RIVAL = 'torque_bias', 'encoder_offset'
 

@@ -17,7 +17,9 @@ from cg_sysid.identification.identify import fit
 from cg_sysid.identification.simulation_error import Problem, attempt, moved, reduced
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.report.wording import event_words
-from cg_sysid.search.candidates import Task, events_of, try_candidate
+from cg_sysid.search.outcome import events_of
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 ZEROS = (0.011, -0.007, 0.004, -0.012)

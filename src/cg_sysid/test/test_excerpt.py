@@ -11,7 +11,9 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.search import excerpt, settings
-from cg_sysid.search.candidates import Task, first_seconds, screen, try_candidate
+from cg_sysid.search.look import first_seconds, screen
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFTER = tuple(Spring('inner', 1.0, (x, 1.0), 150.0, 0.5) for x in (1.3, -1.3))

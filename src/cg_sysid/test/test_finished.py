@@ -9,7 +9,8 @@ from searches import search_for
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, try_candidate
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 
 @pytest.fixture

@@ -14,10 +14,13 @@ from cg_sysid.diagnosis.free_shapes import (
     with_shapes_of_causes,
 )
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, chi2, started_from, try_candidate
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.outcome import chi2
 from cg_sysid.search.ranking import effect_name
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 TRUE, OTHER = 'coulomb_friction', 'position_dependent_friction'
 SURELY = 3.3  # standard deviations: 99.9 % of intervals hold

@@ -12,9 +12,10 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import score
 from cg_sysid.search import model_selection
-from cg_sysid.search.candidates import Task, fit_to_all, try_candidate
 from cg_sysid.search.model_selection import ModelSelection
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import fit_to_all, try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 TWINS = 'foot_compliance', 'spring_nonlinearity'  # where springs may be off a little besides

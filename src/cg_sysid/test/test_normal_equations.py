@@ -7,7 +7,7 @@ from hanging_arm import nominal, recorded
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification import identify
+from cg_sysid.identification import descent, identify
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import _guesses, fit
 from cg_sysid.identification.simulation_error import (
@@ -109,14 +109,14 @@ def test_model_error_counts_by_its_time_and_not_by_its_samples(model_file):
 def test_only_a_round_whose_weights_nobody_knows_stops_early(model_file, monkeypatch):
     model = Model.load(model_file)
     data_sets = prepare(model, _short_pieces(model, 0.004))
-    minimise, drifts, horizons = identify._minimise, [], []
+    minimise, drifts, horizons = identify.minimise, [], []
 
     def told(problem, theta, motions, horizon, weight, iterations, drift, reach, **how):
         drifts.append(drift)
         horizons.append(horizon)
         return minimise(problem, theta, motions, horizon, weight, iterations, drift, reach, **how)
 
-    monkeypatch.setattr(identify, '_minimise', told)
+    monkeypatch.setattr(identify, 'minimise', told)
     first = fit(model, data_sets, only=[])
     # 0.5 s of pieces of 0.6 s are more than four fifths of their samples.
     assert set(horizons) == {first.horizon}
@@ -140,7 +140,7 @@ def test_what_has_no_curvature_left_stays_and_the_others_step():
             own=[(np.eye(1), coupling, np.array([2.0]))], sse=nothing, count=nothing,
             data_cost=1.0, border=Border(0.0, np.zeros(2), np.zeros((2, 2))),
         )  # fmt: skip
-        step, _ = identify._step(point, 0.0, np.array([False, False]))
+        step, _ = descent._step(point, 0.0, np.array([False, False]))
         # Schur complements: 5 - 2 * 2 and 7 - 2 * 2.
         np.testing.assert_allclose(step, [0.0, -3.0])
 
@@ -216,7 +216,7 @@ def test_far_from_the_noise_a_fit_loses_little_by_seeking_no_floor_of_a_valley(
     ]  # fmt: skip
     data_sets = prepare(believed, records)
     found = fit(believed, data_sets)
-    assert found.normalised_error > identify.CLOSE
+    assert found.normalised_error > descent.CLOSE
     monkeypatch.setattr(identify, 'CLOSE', np.inf)
     to_the_floor = fit(believed, data_sets)
     # A thousandth of the cost in each of the last steps: a few per cent in all.

@@ -12,7 +12,9 @@ from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.diagnosis.simpler import simplified, turned_into
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task, chi2, parameters_of, try_candidate
+from cg_sysid.search.outcome import chi2, parameters_of
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 WITH_SHARE, WITHOUT = 'motor_side_friction', 'joint_flexibility'
 SURELY = 3.3  # standard deviations: 99.9 % of intervals hold

@@ -19,10 +19,13 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import unknowns_of
-from cg_sysid.search import candidates, settings
-from cg_sysid.search.candidates import Outcome, Task, one_minimum, screen, try_candidate
+from cg_sysid.search import settings, whole_fit
+from cg_sysid.search.look import screen
 from cg_sysid.search.model_selection import Comparison, at_noise
 from cg_sysid.search.nuisance import SOUND, as_sound_robots, nuisances, with_nuisances
+from cg_sysid.search.outcome import Outcome, one_minimum
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 EFFECTS = (
     'torque_bias', 'encoder_offset', 'actuator_delay', 'actuator_lag', 'quadratic_friction',
@@ -330,7 +333,7 @@ def test_a_fit_with_small_faults_that_goes_astray_goes_on_from_the_one_without(
         far = task.model.with_values({'coulomb_friction.torque': 9.0})
         return fit(far, data_sets, only=(), bounds=task.bounds)
 
-    monkeypatch.setattr(candidates, '_own_fit', astray)
+    monkeypatch.setattr(whole_fit, '_own_fit', astray)
     found = small_faults.with_small_faults(work, plain)
     assert at_noise(found)
 

@@ -12,18 +12,15 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification import identify
+from cg_sysid.identification import descent
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.identify import fit, predict, score
 from cg_sysid.identification.simulation_error import attempt
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
-    Task,
-    first_seconds,
-    own_parameters,
-    screen,
-    try_candidate,
-)
+from cg_sysid.search.look import first_seconds, screen
+from cg_sysid.search.outcome import own_parameters
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 
@@ -277,7 +274,7 @@ def test_steps_that_are_too_long_give_no_fit_up(model_file, monkeypatch):
         steps.append(theta)
         return None if 1 < len(steps) <= 4 else attempt(problem, theta, motions, horizon)
 
-    monkeypatch.setattr(identify, 'attempt', runs_away_behind_the_start)
+    monkeypatch.setattr(descent, 'attempt', runs_away_behind_the_start)
     found = fit(nominal, data_sets, ['c5'], horizon=0.5, reach=1.1)
     assert found.normalised_error < 1.2
     assert found.values[0] == pytest.approx(machine.values['c5'], abs=5 * found.sigmas[0])

@@ -16,18 +16,15 @@ from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import pieces, prepare
 from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.identify import COARSE, fit
-from cg_sysid.search import candidates, settings
-from cg_sysid.search.candidates import (
-    Rival,
-    Task,
-    events_of,
-    first_seconds,
-    own_parameters,
-    try_candidate,
-)
+from cg_sysid.search import look, settings, whole_fit
 from cg_sysid.search.events import undisturbed
+from cg_sysid.search.look import first_seconds
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.outcome import events_of, own_parameters
+from cg_sysid.search.starts import starting_models
 from cg_sysid.search.successive_halving import SuccessiveHalving, worth_having
+from cg_sysid.search.task import Rival, Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 OFF = {'c1': 1.06, 'c5': 0.92}  # of the nominal values
@@ -241,10 +238,10 @@ def test_a_start_near_the_noise_is_followed_whatever_the_reach(
         tried.append(start.normalised_error)
         return replace(start, converged=True)
 
-    monkeypatch.setattr(candidates, '_whole', whole)
-    monkeypatch.setattr(candidates, 'far', lambda fitted, bounds: {'leg_mass': 4.9})
+    monkeypatch.setattr(whole_fit, '_whole', whole)
+    monkeypatch.setattr(whole_fit, 'far', lambda fitted, bounds: {'leg_mass': 4.9})
     task = Task(nominal, ('payload', None), warm_starts=starts, reach=1.07)
-    candidates._own_fit(task, train)
+    whole_fit._own_fit(task, train)
     assert tried == pytest.approx([1.06, error][: 1 + followed])
 
 
@@ -300,9 +297,9 @@ def test_what_takes_long_waits_where_it_is_idle_beside_the_best_look(quick, roto
 
     def carry_out(function, arguments, what):
         tasks = [each[0] for each in arguments]
-        if function is candidates.screen:
+        if function is look.screen:
             looks = {'torque_bias': ahead, 'payload': 55.0, 'backlash': rotor}
-            return [candidates.Screening(t.effect[0], t, looks[t.effect[0]]) for t in tasks]
+            return [look.Screening(t.effect[0], t, looks[t.effect[0]]) for t in tasks]
         if function is undisturbed:
             return [(None, None)]
         tried.extend(t.effect[0] for t in tasks)
@@ -333,12 +330,12 @@ def test_a_rotor_that_torques_speak_less_for_waits(behind, left, looked_at, wait
 
     def carry_out(function, arguments, what):
         tasks = [each[0] for each in arguments]
-        if function is candidates.torque_fits:
+        if function is look.torque_fits:
             fitted = torque_error.fit_by_torque(believed, train)
             return [(replace(fitted, deviance=said[t.effect[0]]),) for t in tasks]
-        if function is candidates.screen:
+        if function is look.screen:
             looks.extend(t.effect[0] for t in tasks)
-            return [candidates.Screening(t.effect[0], t, left) for t in tasks]
+            return [look.Screening(t.effect[0], t, left) for t in tasks]
         if function is undisturbed:
             return [(None, None)]
         fits = replace(plain.train, mse=np.full_like(plain.train.mse, left))
@@ -393,7 +390,7 @@ def test_a_look_at_a_law_without_states_goes_on_from_where_the_base_stands(quick
     _, _, base = quick
     laws = {name: nominal_with(base.model, name) for name in ('torque_bias', 'backlash')}
     starts = {
-        name: candidates._beside_base(replace(base, effect=(name, None)), model, [])
+        name: look._beside_base(replace(base, effect=(name, None)), model, [])
         for name, model in laws.items()
     }
     assert starts['backlash'] is None  # a rotor sets out from what the file believes
@@ -405,13 +402,13 @@ def test_a_look_at_a_law_without_states_goes_on_from_where_the_base_stands(quick
 
 def nominal_with(model, name):
     """A model with an effect at its first start."""
-    return next(candidates._starting_models(Task(model, (name, None))))
+    return next(starting_models(Task(model, (name, None))))
 
 
 def test_first_looks_in_the_plane_take_coarse_steps(quick):
     train, _, base = quick
-    look = candidates.screen(replace(base, effect=('torque_bias', None)), train)
-    (found, *_) = look.task.warm_starts
+    screening = look.screen(replace(base, effect=('torque_bias', None)), train)
+    (found, *_) = screening.task.warm_starts
     assert found.refinement == COARSE
     assert base.first.refinement == 1.0
 

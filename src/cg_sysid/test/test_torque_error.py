@@ -27,16 +27,12 @@ from cg_sysid.identification.torque_error import (
     scale_of,
 )
 from cg_sysid.identification.windows import followed
-from cg_sysid.search import candidates
-from cg_sysid.search.candidates import (
-    Rival,
-    Task,
-    candidates_for,
-    shared_unknowns,
-    starts_of,
-    try_candidate,
-)
+from cg_sysid.search import look
+from cg_sysid.search.outcome import shared_unknowns
+from cg_sysid.search.starts import starts_of
+from cg_sysid.search.task import Rival, Task, candidates_for
 from cg_sysid.search.torque_screening import KEPT, SEEN, Scores, scores
+from cg_sysid.search.whole_fit import try_candidate
 
 OFF = {
     'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
@@ -452,10 +448,10 @@ def test_a_rotor_is_not_simulated_where_torques_speak_clearly_for_a_rival(
     rival = Rival(believed.with_effect('coulomb_friction', None), {}, {})
     task = Task(believed, ('backlash', None), rival=rival)
     if ruled_out:
-        monkeypatch.setattr(candidates, 'fit', None)
-    look = candidates.screen(task, finger.data(machine, 2, 8.0))
-    assert np.isinf(look.error) == ruled_out
-    assert bool(look.task.warm_starts) != ruled_out
+        monkeypatch.setattr(look, 'fit', None)
+    found = look.screen(task, finger.data(machine, 2, 8.0))
+    assert np.isinf(found.error) == ruled_out
+    assert bool(found.task.warm_starts) != ruled_out
 
 
 def test_likelihoods_are_compared_over_the_same_windows(believed):

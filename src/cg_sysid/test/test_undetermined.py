@@ -19,8 +19,9 @@ from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import fit
 from cg_sysid.learned.shape import Shape
 from cg_sysid.learned.unmodelled import Unmodelled
-from cg_sysid.search.candidates import Task, try_candidate
 from cg_sysid.search.model_selection import ModelSelection
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 SOFT = {'stiffness': 300.0, 'rotor_inertia': 0.1, 'damping': 0.6}

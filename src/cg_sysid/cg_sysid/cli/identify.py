@@ -21,7 +21,8 @@ from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
 from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import DataSet, prepare
-from cg_sysid.identification.identify import Fit, fit, predict, score
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import fit, predict, score
 from cg_sysid.identification.nelder_mead import nelder_mead
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.progress import Bars

@@ -18,11 +18,14 @@ from cg_dynamics.model import Model
 from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit, fit
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import IdentificationError, own_unknowns
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, candidates_for, started_from
 from cg_sysid.search.nuisance import turning
+from cg_sysid.search.outcome import Outcome
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import candidates_for
 
 FEWEST_RECORDINGS = 3  # recordings: two always differ
 MOST_RECORDINGS = 30  # recordings; of more, as the steps of a walk, none is a session

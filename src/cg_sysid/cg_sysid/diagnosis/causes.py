@@ -13,9 +13,11 @@ from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.ties import fitted_to_all, tie
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
+from cg_sysid.search.model_selection import Comparison
+from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.outcome import (
     Outcome,
     events_in,
     events_of,
@@ -23,8 +25,6 @@ from cg_sysid.search.candidates import (
     parameters_of,
     shared_parameters,
 )
-from cg_sysid.search.model_selection import Comparison
-from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.ranking import contains, effect_name
 
 log = logging.getLogger(__name__)

@@ -11,19 +11,14 @@ from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
-    Outcome,
-    Task,
-    candidates_for,
-    chi2,
-    first_seconds,
-    rival_of,
-)
+from cg_sysid.search.look import first_seconds, rival_of
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import SOUND_LAWS, nuisances
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.ranking import per_output
 from cg_sysid.search.standings import title_of
 from cg_sysid.search.successive_halving import Effects
+from cg_sysid.search.task import Task, candidates_for
 from cg_sysid.search.torque_screening import KEPT, scores
 
 

@@ -27,9 +27,11 @@ from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.learned.characterise import characterise, what_remains
 from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, prior_conflicts, started_from
 from cg_sysid.search.model_selection import above_noise, at_noise, share_explained
+from cg_sysid.search.outcome import Outcome, chi2, prior_conflicts
 from cg_sysid.search.standings import Unfinished
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import Task
 
 log = logging.getLogger(__name__)
 

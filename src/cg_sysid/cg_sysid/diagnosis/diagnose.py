@@ -34,8 +34,8 @@ from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Task
 from cg_sysid.search.standings import Unfinished
+from cg_sysid.search.task import Task
 from cg_sysid.stances.held_foot import held_by_friction
 from cg_sysid.stances.phases import Landing, cut_steps
 

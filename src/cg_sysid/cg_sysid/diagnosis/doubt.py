@@ -7,11 +7,13 @@ from cg_sysid.diagnosis.comparing import compare, effects_on
 from cg_sysid.diagnosis.small_faults import with_law
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
-from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
 from cg_sysid.search.model_selection import Comparison
 from cg_sysid.search.nuisance import with_nuisances
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.ranking import contains
+from cg_sysid.search.starts import started_from
 from cg_sysid.search.successive_halving import Effects
+from cg_sysid.search.task import Task
 
 log = logging.getLogger(__name__)
 

@@ -6,10 +6,11 @@ from cg_sysid.diagnosis.comparing import done
 from cg_sysid.diagnosis.conclude import answer, verdict_of
 from cg_sysid.diagnosis.result import Diagnosis, Verdict
 from cg_sysid.diagnosis.workspace import Workspace
-from cg_sysid.search.candidates import Outcome, candidates_for, chi2
 from cg_sysid.search.model_selection import share_explained
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.standings import Unfinished
+from cg_sysid.search.task import candidates_for
 
 
 def answer_so_far(work: Workspace, nominal: Outcome) -> Diagnosis:

@@ -19,12 +19,13 @@ from cg_interfaces.channels import interface
 from cg_sysid.experiments.catalogue import Experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.identification.data_set import DataSet, as_data_set
-from cg_sysid.identification.identify import Fit, fit, predict
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import fit, predict
 from cg_sysid.identification.information_criterion import evidence
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.parallel import run_all
 from cg_sysid.records.record import Record
-from cg_sysid.search.candidates import Outcome
+from cg_sysid.search.outcome import Outcome
 
 STEP_S = 0.002
 FASTER = 4.0  # an excitation is also rehearsed with so many times its highest frequency

@@ -13,8 +13,8 @@ from cg_sysid.diagnosis.small_faults import (
 from cg_sysid.diagnosis.thorough import finished
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome
 from cg_sysid.search.model_selection import above_noise, settled
+from cg_sysid.search.outcome import Outcome
 
 
 def extend(work: Workspace, o: Outcome) -> Outcome:

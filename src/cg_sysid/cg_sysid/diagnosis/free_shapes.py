@@ -13,10 +13,12 @@ import numpy as np
 from cg_dynamics.effects.effect import Effect
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, started_from
 from cg_sysid.search.model_selection import Comparison, above_noise, at_noise, settled
 from cg_sysid.search.nuisance import Bounds
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import Task
 
 PURE = 1e-3  # share of its range that a mixture may lie off an end of it, and count as pure
 

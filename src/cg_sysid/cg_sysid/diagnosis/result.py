@@ -16,8 +16,8 @@ from cg_sysid.diagnosis.between_recordings import Wandering
 from cg_sysid.diagnosis.experiment_design import Proposal
 from cg_sysid.experiments.catalogue import Experiment
 from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.gain import Gain
-from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.measured_start import MeasuredStart
 from cg_sysid.landings.result import Landings
 from cg_sysid.learned.unmodelled import Unmodelled

@@ -11,8 +11,10 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, parameters_of, started_from
+from cg_sysid.search.outcome import Outcome, parameters_of
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import Task
 
 
 def simplified(work: Workspace, o: Outcome) -> Outcome:

@@ -17,7 +17,6 @@ from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
 from cg_sysid.identification import torque_error
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, parameters_of, started_from
 from cg_sysid.search.model_selection import (
     Comparison,
     above_noise,
@@ -32,9 +31,12 @@ from cg_sysid.search.nuisance import (
     nuisances,
     with_nuisances,
 )
+from cg_sysid.search.outcome import Outcome, chi2, parameters_of
 from cg_sysid.search.ranking import Candidate, effect_name
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.starts import started_from
 from cg_sysid.search.successive_halving import Effects
+from cg_sysid.search.task import Task
 from cg_sysid.text import measured
 
 log = logging.getLogger(__name__)

@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 from cg_sysid.diagnosis.workspace import Workspace, structure
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, one_minimum, started_from
 from cg_sysid.search.model_selection import settled
+from cg_sysid.search.outcome import Outcome, chi2, one_minimum
 from cg_sysid.search.ranking import per_output
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.starts import started_from
+from cg_sysid.search.task import Task
 
 
 def thorough(work: Workspace, o: Outcome) -> Outcome:

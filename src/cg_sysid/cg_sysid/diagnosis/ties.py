@@ -5,12 +5,13 @@ from cg_sysid.diagnosis.small_faults import shown
 from cg_sysid.diagnosis.thorough import thorough
 from cg_sysid.diagnosis.workspace import Workspace, structure
 from cg_sysid.errors import Failure
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, fit_to_all
 from cg_sysid.search.model_selection import Comparison, at_noise
+from cg_sysid.search.outcome import Outcome
 from cg_sysid.search.ranking import contains
 from cg_sysid.search.standings import title_of
+from cg_sysid.search.whole_fit import fit_to_all
 
 
 def tie(work: Workspace, comparison: Comparison, label: str) -> Comparison | None:

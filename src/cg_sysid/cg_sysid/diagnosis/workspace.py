@@ -10,13 +10,13 @@ from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.kept_fits import keeping
 from cg_sysid.parallel import run_all
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome
 from cg_sysid.search.model_selection import Comparison, ModelSelection
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.outcome import Outcome
 from cg_sysid.search.ranking import Round, per_output
 from cg_sysid.search.standings import SoFar, title_of
 from cg_sysid.search.successive_halving import SuccessiveHalving

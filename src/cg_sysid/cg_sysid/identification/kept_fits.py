@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,52 @@ def place_of(model: Model, data_sets: Sequence[DataSet], **options: Any) -> Path
     return folder / f'{digest.hexdigest()[:32]}.json'
 
 
-def recall(place: Path | None) -> Mapping[str, Any] | None:
+@dataclass(frozen=True)
+class End:
+    """Where a fit came to, before anybody asks how sure that is; as numbers it can be kept.
+
+    Attributes:
+        theta: Coordinates of the unknowns, shape (k,).
+        motions: What each data set has of its own.
+        cost: Final cost.
+        sse: Squared error over noise variance of each data set and output, shape (data sets, ny).
+        count: Samples behind it.
+        weight: Of the residual in the cost.
+        converged: Whether it is a minimum.
+    """
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    cost: float
+    sse: np.ndarray
+    count: np.ndarray
+    weight: float
+    converged: bool
+
+    def numbers(self) -> dict[str, Any]:
+        """All of it as lists."""
+        return {
+            'theta': self.theta.tolist(), 'motions': [m.tolist() for m in self.motions],
+            'cost': self.cost, 'sse': self.sse.tolist(), 'count': self.count.tolist(),
+            'weight': self.weight, 'converged': self.converged,
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, numbers: Mapping[str, Any] | None) -> 'End | None':
+        """What `numbers` wrote; None of nothing, or of something else."""
+        try:
+            return None if numbers is None else cls(
+                np.array(numbers['theta'], float),
+                [np.array(m, float) for m in numbers['motions']],
+                float(numbers['cost']), np.array(numbers['sse'], float),
+                np.array(numbers['count'], float), float(numbers['weight']),
+                bool(numbers['converged']),
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError):
+            return None
+
+
+def recall(place: Path | None) -> End | None:
     """Where a fit came to; None where it is not known, or its file is damaged."""
     if place is None:
         return None
@@ -75,17 +120,17 @@ def recall(place: Path | None) -> Mapping[str, Any] | None:
         end = parse_json(read_text(place, limits=JSON), str(place))
     except DocumentError:
         return None
-    return end if isinstance(end, dict) else None
+    return End.of(end) if isinstance(end, dict) else None
 
 
-def keep(place: Path | None, end: Mapping[str, Any]) -> None:
-    """Keep where a fit came to: numbers, and lists of them.
+def keep(place: Path | None, end: End) -> None:
+    """Keep where a fit came to.
 
     A folder that cannot be written to costs the next run its time, and this one nothing.
     """
     if place is not None:
         with contextlib.suppress(OSError):
-            write_atomically(place, json.dumps(end))
+            write_atomically(place, json.dumps(end.numbers()))
 
 
 @functools.cache

@@ -17,8 +17,9 @@ import numpy as np
 
 from cg_dynamics.mechanisms.mechanism import Mechanism
 from cg_sysid.identification.data_set import DataSet, sensor_matrix
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.gain import NO_GAIN, Gain
-from cg_sysid.identification.identify import Fit, predict, score
+from cg_sysid.identification.identify import predict, score
 from cg_sysid.text import listed, number, scaled
 
 OWN_PART = 0.5  # of the nominal model's error, that the noise of the start may make

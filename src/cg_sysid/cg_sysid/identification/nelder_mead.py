@@ -17,7 +17,8 @@ import scipy
 
 from cg_dynamics.model import Model
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit, Progress, score
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import Progress, score
 from cg_sysid.identification.simulation_error import Problem
 from cg_sysid.identification.unknowns import (
     IdentificationError,

@@ -19,15 +19,18 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit, fit, in_data_set, score
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, without_events
 from cg_sysid.learned.linear_response import cut, pieces_of, simulated_signals
 from cg_sysid.learned.residual_terms import BEYOND, Sketches, Term
 from cg_sysid.learned.shape import GRID, function_of, shape_of
 from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import Outcome, Task, chi2, try_candidate
 from cg_sysid.search.model_selection import Comparison, ModelSelection, share_explained
+from cg_sysid.search.outcome import Outcome, chi2
+from cg_sysid.search.task import Task
+from cg_sysid.search.whole_fit import try_candidate
 
 SKETCHES = 'learned terms on pieces of the records'
 FINALISTS = 4
@@ -198,7 +201,7 @@ def _smooth_or_periodic(
         if again is not None and chi2(again.ranked[0][1]) < chi2(found):
             found = again.ranked[0][1]
             variable = _variable(effect, found, windows)
-    at = {u.name: float(v) for u, v in zip(found.train.unknowns, found.train.values, strict=True)}
+    at = found.train.numbers
     task = replace(base.task, model=_extended(base.model, label, found.task.model))
     arguments = (task, at, base.events, *sides)
     (whole,) = run(whole_fit, [arguments], f'{label} on whole records')

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.effects.unmodelled import LearnedEffect
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 
 MOST_TURNS = 16  # waves in a turn that a short stretch of it is tried with
 GRID = 121

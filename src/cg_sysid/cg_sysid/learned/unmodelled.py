@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from cg_dynamics.effects.effect import TIME
 from cg_dynamics.effects.unmodelled import UNITS, JointTerm, LearnedEffect, OuterTerm, SensorTerm
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.learned.shape import Shape
 from cg_sysid.text import listed, number, scaled, sentence
 

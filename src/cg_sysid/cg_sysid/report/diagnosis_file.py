@@ -25,8 +25,8 @@ from cg_sysid.diagnosis.next_step import next_step
 from cg_sysid.diagnosis.result import Cause, Diagnosis, gains_of
 from cg_sysid.diagnosis.summary import INTERVAL, is_determined
 from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.gain import Gain
-from cg_sysid.identification.identify import Fit
 from cg_sysid.identification.unknowns import Unknown
 from cg_sysid.identification.windows import Windows
 from cg_sysid.learned.unmodelled import term_words, variable_words

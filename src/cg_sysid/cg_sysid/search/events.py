@@ -17,7 +17,8 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.identification.data_set import DataSet, pieces
-from cg_sysid.identification.identify import Fit, fit, in_data_set, score
+from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.identify import fit, in_data_set, score
 from cg_sysid.identification.unknowns import IdentificationError, awake, own_unknowns
 from cg_sysid.search import settings
 from cg_sysid.search.nuisance import Bounds

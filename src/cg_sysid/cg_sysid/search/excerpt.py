@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.unknowns import unsettled_states
 from cg_sysid.search import settings
 

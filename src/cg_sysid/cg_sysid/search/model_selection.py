@@ -12,10 +12,11 @@ from cg_dynamics.effects.effect import Effect
 from cg_dynamics.effects.external_push import ExternalPush
 from cg_sysid.errors import Failure
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.information_criterion import block_gain, evidence, independent_samples
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
+from cg_sysid.search.nuisance import as_sound_robots, faults_among
+from cg_sysid.search.outcome import (
     Outcome,
     at_edge,
     chi2,
@@ -26,7 +27,6 @@ from cg_sysid.search.candidates import (
     too_small,
     undetermined_size,
 )
-from cg_sysid.search.nuisance import as_sound_robots, faults_among
 from cg_sysid.search.ranking import Candidate, contains, per_output
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 
 
 @dataclass(frozen=True)

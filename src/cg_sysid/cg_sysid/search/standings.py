@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from cg_sysid.search.candidates import Outcome, Screening, Task
+from cg_sysid.search.look import Screening
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.outcome import Outcome
+from cg_sysid.search.task import Task
 from cg_sysid.text import listed, number, off_by
 
 NAMED = 3  # candidates that a sentence names

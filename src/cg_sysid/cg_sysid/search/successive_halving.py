@@ -23,28 +23,18 @@ import numpy as np
 from cg_sysid.errors import Failure
 from cg_sysid.identification import along_motion, torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.identify import Fit
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.parallel import CarryOut
 from cg_sysid.search import settings
-from cg_sysid.search.candidates import (
-    Outcome,
-    Screening,
-    Task,
-    chi2,
-    cost_of,
-    deeper,
-    effect_of,
-    eventful,
-    led_on,
-    rival_of,
-    screen,
-    torque_fits,
-    try_candidate,
-)
 from cg_sysid.search.events import undisturbed
+from cg_sysid.search.look import Screening, deeper, led_on, rival_of, screen, torque_fits
 from cg_sysid.search.model_selection import samples
 from cg_sysid.search.nuisance import nuisances
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.ranking import per_output
+from cg_sysid.search.starts import starts_of
+from cg_sysid.search.task import Task, effect_of, eventful
+from cg_sysid.search.whole_fit import try_candidate
 
 log = logging.getLogger(__name__)
 
@@ -388,7 +378,7 @@ def _light(tasks: Iterable[Task]) -> list[Task]:
 
 def _is_heavy(task: Task) -> bool:
     """Whether it waits for the light ones: what those come to shows how far it may go."""
-    return cost_of(task) >= settings.HALVING.heavy
+    return _cost_of(task) >= settings.HALVING.heavy
 
 
 def _deviance(task: Task) -> float:
@@ -420,7 +410,15 @@ def _moves_another(task: Task, joint: str) -> bool:
 
 def _longest_first(tasks: Iterable[Task]) -> list[Task]:
     """Or the last of them would be waited for."""
-    return sorted(tasks, key=cost_of, reverse=True)
+    return sorted(tasks, key=_cost_of, reverse=True)
+
+
+def _cost_of(task: Task) -> int:
+    """Candidates of higher rank take longer to fit: more starts, states, records of their own."""
+    effect = effect_of(task)
+    assert effect is not None
+    swept = any(p.swept for p in effect.parameters)
+    return 100 * eventful(task) + 10 * bool(effect.states) + 10 * swept + len(starts_of(effect))
 
 
 def _known(screening: Screening) -> float:

@@ -38,8 +38,8 @@ from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.torque_error import Motion, Problem, TorqueFit
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.parallel import CarryOut, one_by_one
-from cg_sysid.search.candidates import starts_of
 from cg_sysid.search.nuisance import Bounds
+from cg_sysid.search.starts import starts_of
 
 FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
