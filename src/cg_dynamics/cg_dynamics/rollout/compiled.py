@@ -17,16 +17,14 @@ from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
+from cg_dynamics.rollout.accuracy import REFERENCE_STEP, Accuracy
 from cg_dynamics.rollout.compiler import compiler
-from cg_dynamics.rollout.fallback import HALVINGS, InterpretedRollout
+from cg_dynamics.rollout.fallback import InterpretedRollout
 from cg_dynamics.rollout.native import NativeRollout, symbols_of
 from cg_dynamics.rollout.vector_code import UnsupportedError
 
 log = logging.getLogger(__name__)
 
-REFERENCE_STEP = 0.002
-TOLERANCE = 3e-7  # error of a step in units of the state scales; play multiplies it
-COARSE_HALVINGS = 3  # of a step of a coarse simulation: stiffer than real drives are no drives
 SMALLEST_STEP = 1e-4
 SAME_INSTANT = 1e-9  # s
 STIFFNESS = 1.0  # step times fastest rate; Runge-Kutta's fourth order is unstable beyond 2.8
@@ -250,7 +248,7 @@ class CompiledModel:
         states = np.empty((n, self.nx))
         inputs = _array(rows.inputs)
         done = self._c.cgm_simulate(
-            n, _array(np.diff(time)), *_accuracy(refinement), inputs, x0, p, states, 0, None
+            n, _array(np.diff(time)), *Accuracy.of(refinement), inputs, x0, p, states, 0, None
         )
         if done < n:
             raise SimulationError(
@@ -292,14 +290,14 @@ class CompiledModel:
             p: Parameter vector, shape (np,).
             measured: Outputs, NaN where there is no sample, shape (n, ny).
             weight: 1 / standard deviation of each output, shape (ny,).
-            refinement: Integration steps in place of one (`_accuracy`). If more than one,
+            refinement: Integration steps in place of one (`Accuracy.of`). If more than one,
                 inputs that come late change at their instants, else a row has their mean.
         """
         time, u, x0, p = self._checked(time, u, x0, p)
         measured = _shaped('measured', measured, (len(time), self.ny))
         weight = _shaped('weight', weight, (self.ny,))
         return Judged(self, self._late_rows(time, u, p, refinement), x0, p, measured, weight,
-                      _accuracy(refinement))  # fmt: skip
+                      Accuracy.of(refinement))  # fmt: skip
 
     def normal(
         self,
@@ -346,7 +344,7 @@ class Judged:
         p: np.ndarray,
         measured: np.ndarray,
         weight: np.ndarray,
-        accuracy: tuple[float, float, int],
+        accuracy: Accuracy,
     ):
         self._compiled, self._rows, self._x0, self._p = compiled, rows, x0, p
         self._weight, self._accuracy = weight, accuracy
@@ -354,7 +352,7 @@ class Judged:
         self._samples[rows.recorded] = measured
         _, self._delays, self._delays_by = compiled.delays(p)
         self._simulated = compiled._c.cgm_follow(
-            len(rows.time), rows.time, *accuracy, _array(rows.inputs), x0, p,
+            len(rows.time), rows.time, accuracy, _array(rows.inputs), x0, p,
             _array(self._delays),
         )  # fmt: skip
         done = len(self._simulated.outputs)
@@ -386,7 +384,7 @@ class Judged:
         done = len(self._simulated.outputs)
         if done == m:
             compiled._c.cgm_normal(
-                self._simulated, m, rows.time, *self._accuracy, _array(rows.inputs),
+                self._simulated, m, rows.time, self._accuracy, _array(rows.inputs),
                 _array(rows.slope), first, self._x0, s0, self._p, nc, column, self._samples,
                 self._weight, _array(self._delays), np.array(others, dtype=np.int32),
                 normal.hessian, normal.gradient, j,
@@ -443,15 +441,6 @@ def simulate(
     x0 = compiled.initial_state(motion, u[0], p)
     states = compiled.simulate(time, u, x0, p)
     return states, compiled.outputs(time, u, states, p)
-
-
-def _accuracy(refinement: float) -> tuple[float, float, int]:
-    """Longest step in s, the error of a step from which it is halved, and how often at most.
-
-    What takes shorter steps than a coarse simulation may take runs away in it.
-    """
-    halvings = HALVINGS if refinement >= 1 else COARSE_HALVINGS
-    return REFERENCE_STEP / refinement, TOLERANCE / refinement**4, halvings
 
 
 def _array(a) -> np.ndarray:

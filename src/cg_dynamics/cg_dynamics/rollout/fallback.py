@@ -13,11 +13,11 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations
+from cg_dynamics.rollout.accuracy import HALVINGS, Accuracy
 
 CHUNK = 128
 # As in rollout.c, which gets them from here.
 STATE_LIMIT = 1e6  # of any state; beyond, the motion has run away
-HALVINGS = 5  # of a step, one after the other
 STABLE = 2.5  # step times rate of decay; the method's limit is 2.785
 EASY = 0.03  # of the tolerance: a step of fourth order twice as long errs 16 times as much
 
@@ -64,10 +64,10 @@ class InterpretedRollout:
             x[:] = path[:, -1]
 
     def cgm_simulate(
-        self, n: int, dt, largest: float, tolerance: float, halvings: int, u, x0, p, X, most, steps
+        self, n: int, dt, longest: float, tolerance: float, halvings: int, u, x0, p, X, most, steps
     ) -> int:
         """States at all rows; the number of rows before the state ran away."""
-        path, row, _ = self._paced(dt, u, p, x0, largest, tolerance, halvings, None)
+        path, row, _ = self._paced(dt, u, p, x0, Accuracy(longest, tolerance, halvings), None)
         X[:] = path[row]
         return _sane_rows(X)
 
@@ -81,19 +81,19 @@ class InterpretedRollout:
             at, late = _interpolate(time, time - delay[j], X, *ends)
             Y[:, j] = np.asarray(self._h(late.T, u[at].T, p))[j]
 
-    def cgm_follow(self, n, time, largest, tolerance, halvings, u, x0, p, delay) -> Simulated:
+    def cgm_follow(self, n, time, accuracy: Accuracy, u, x0, p, delay) -> Simulated:
         """The states and outputs of a record, up to where the state runs away."""
         states = np.empty((n, self.nx))
         done = self.cgm_simulate(
-            n, np.diff(time), largest, tolerance, halvings, u, x0, p, states, 0, None
+            n, np.diff(time), *accuracy, u, x0, p, states, 0, None
         )  # fmt: skip
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time[:done], u[:done], p, states[:done], delay, y)
         return Simulated(y, states, np.zeros((n, 0), np.int32))
 
     def cgm_normal(
-        self, simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p, nc,
-        column, measured, weight, delay, delay_to, H, g, Jacobian,
+        self, simulated, n, time, accuracy: Accuracy, u, du, delay_column, x0, S0, p, nc, column,
+        measured, weight, delay, delay_to, H, g, Jacobian,
     ) -> None:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13)."""
         nx, ny = self.nx, self.ny
@@ -106,9 +106,7 @@ class InterpretedRollout:
         if delay_column >= 0:
             chain[-1, delay_column] += 1
         start = np.concatenate([x0, np.eye(nx, width).ravel(order='F')])
-        _, row, steps = self._paced(
-            np.diff(time), u, p, x0, largest, tolerance, halvings, self._decay
-        )
+        _, row, steps = self._paced(np.diff(time), u, p, x0, accuracy, self._decay)
         held = np.repeat(np.hstack([u, du])[:-1], np.diff(row), axis=0).T
         path = self._chain(self._sensitive_step, start, held, p, steps)
         rows = np.hstack([start[:, None], path])[:, row].T
@@ -198,7 +196,7 @@ class InterpretedRollout:
         e = self.equations
         return ca.Function('decay', [e.x, e.u, e.p], [-ca.trace(ca.jacobian(e.rates, e.x))])
 
-    def _paced(self, dt, u, p, x0, largest, tolerance, halvings, decay):
+    def _paced(self, dt, u, p, x0, accuracy: Accuracy, decay):
         """Steps halved where they err or, with `decay`, are not stable: `follow` in rollout.c.
 
         Returns:
@@ -208,7 +206,7 @@ class InterpretedRollout:
         path, lengths, row = [np.array(x0, float)], [], [0]
         halved, whole = 0, 1 << HALVINGS
         for held, interval in zip(u[:-1], dt, strict=True):
-            pieces = max(1, int(np.ceil(interval / largest * (1 - 1e-9))))
+            pieces = max(1, int(np.ceil(interval / accuracy.longest * (1 - 1e-9))))
             for _ in range(pieces):
                 done = 0
                 while done < whole:
@@ -217,8 +215,8 @@ class InterpretedRollout:
                         halved += 1
                         continue
                     y, error = self._probe(x, held, p, h)
-                    error = float(error) / tolerance
-                    if error > 1 and halved < halvings:
+                    error = float(error) / accuracy.tolerance
+                    if error > 1 and halved < accuracy.halvings:
                         halved += 1
                         continue
                     done += size

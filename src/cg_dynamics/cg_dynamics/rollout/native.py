@@ -17,10 +17,10 @@ import casadi as ca
 import numpy as np
 
 from cg_dynamics.assemble import Equations
+from cg_dynamics.rollout.accuracy import HALVINGS, Accuracy
 from cg_dynamics.rollout.compiler import object_file, shared_library
 from cg_dynamics.rollout.fallback import (
     EASY,
-    HALVINGS,
     STABLE,
     STATE_LIMIT,
     InterpretedRollout,
@@ -62,15 +62,13 @@ class NativeRollout:
     def _interpreted(self) -> InterpretedRollout:
         return InterpretedRollout(self.equations, self.free)
 
-    def cgm_follow(self, n, time, largest, tolerance, halvings, u, x0, p, delay) -> Simulated:
+    def cgm_follow(self, n, time, accuracy: Accuracy, u, x0, p, delay) -> Simulated:
         """The states and outputs of a record, up to where the state runs away.
 
         Args:
             n: Rows.
             time: Their stamps in s, shape (n,).
-            largest: Longest integration step in s.
-            tolerance: Error of a step, in units of the states' scales, from which it is halved.
-            halvings: Times that it is, at most.
+            accuracy: Of the integration.
             u: Inputs, each held until the next row, shape (n, nu).
             x0: State at the first row, shape (nx,).
             p: Parameter vector.
@@ -78,18 +76,16 @@ class NativeRollout:
         """
         states = np.empty((n, self.nx))
         rows = np.diff(time)
-        most = max(1, int(np.ceil(rows.max(initial=0.0) / largest)))
+        most = max(1, int(np.ceil(rows.max(initial=0.0) / accuracy.longest)))
         steps = np.zeros((n, most), np.int32)
-        done = self.cgm_simulate(
-            n, rows, largest, tolerance, halvings, u, x0, p, states, most, steps
-        )
+        done = self.cgm_simulate(n, rows, *accuracy, u, x0, p, states, most, steps)
         y = np.empty((done, self.ny))
         self.cgm_outputs(done, time, u, p, states, delay, y)
         return Simulated(y, states, steps)
 
     def cgm_normal(
-        self, simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p, nc,
-        column, measured, weight, delay, delay_to, H, g, Jacobian,
+        self, simulated, n, time, accuracy: Accuracy, u, du, delay_column, x0, S0, p, nc, column,
+        measured, weight, delay, delay_to, H, g, Jacobian,
     ) -> None:  # fmt: skip
         """Normal equations of the simulation error (Eq. 4.13) of a record that was followed.
 
@@ -99,9 +95,7 @@ class NativeRollout:
             simulated: What `cgm_follow` said of the same arguments.
             n: Rows.
             time: Their stamps in s, shape (n,).
-            largest: Longest integration step in s.
-            tolerance: As of cgm_follow.
-            halvings: As of cgm_follow.
+            accuracy: Of the integration.
             u: Inputs, each held until the next row, shape (n, nu).
             du: Their derivative by their delay, shape (n, nu).
             delay_column: Column of that delay, or -1.
@@ -126,8 +120,8 @@ class NativeRollout:
             kernel = self._windows
         except UnsupportedError:
             self._interpreted.cgm_normal(
-                simulated, n, time, largest, tolerance, halvings, u, du, delay_column, x0, S0, p,
-                nc, column, measured, weight, delay, delay_to, H, g, Jacobian,
+                simulated, n, time, accuracy, u, du, delay_column, x0, S0, p, nc, column,
+                measured, weight, delay, delay_to, H, g, Jacobian,
             )  # fmt: skip
             return
         active = np.flatnonzero(column >= 0)
@@ -148,7 +142,7 @@ class NativeRollout:
             at = slice(a, a + WIDTH)
             if not kernel(
                 lanes.first[at], lanes.length[at], lanes.start[at], lanes.until[at],
-                lanes.handed[at], time, largest, u, du, p, k, place, lanes.late,
+                lanes.handed[at], time, accuracy.longest, u, du, p, k, place, lanes.late,
                 simulated.states, steps.shape[1], steps, residual, weights, delay,
                 late_outputs, hessian[at], gradient[at], handed[at], by_lane,
             ):  # fmt: skip

@@ -11,7 +11,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
-from cg_dynamics.rollout.compiled import REFERENCE_STEP
+from cg_dynamics.rollout.accuracy import REFERENCE_STEP
 
 # Places whose effects go together: the equations of each change alike.
 PLACES = ('sensor',), ('timing',), ('command', 'transmission', 'joint'), ('environment', 'body')
