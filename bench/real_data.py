@@ -35,7 +35,6 @@ from cg_sysid.identification.measured_start import carried, from_measured_angles
 from cg_sysid.identification.windows import Windows, followed, windows_of
 from cg_sysid.records.bags import read_bag
 from cg_sysid.records.importing import import_to_bags
-from cg_sysid.search.whole_fit import with_priors_of
 from cg_sysid.text import measured
 
 BUDGET = 600.0  # s
@@ -143,9 +142,6 @@ def run(study, data, bags, workers, budget):
     before = cpu_seconds()
     found = diagnose(nominal, used, Options(workers=workers), deadline=Deadline(budget))
     searched = cpu_seconds() - before
-    # To all that may be used: the file's beliefs, and what was found as a start.
-    structure = with_priors_of(found.extended.model, nominal, '')
-    extended = fit(structure, prepare(nominal, used), at=found.extended.model.values).model
     rows = {'published': errors(study, nominal, judges, carry)}
     if study.zeroed:
         published = nominal
@@ -154,7 +150,7 @@ def run(study, data, bags, workers, budget):
         rows['published, with a zero for each recording'] = errors(study, published, judges, carry)
     rows |= {
         'published model, identified anew': errors(study, refitted, judges, carry),
-        'with the causes named': errors(study, extended, judges, carry),
+        'with the causes named': errors(study, found.model, judges, carry),
     }
     channels = nominal.mechanism.outputs
     present = [j for j in range(len(channels)) if np.isfinite(rows['published'][0, j])]

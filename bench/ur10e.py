@@ -155,7 +155,7 @@ def main() -> None:
     say(_row('ours, plain friction', relative(model.with_values(plain.values), sets[HELD])))
     records = [read(options.data, name, body) for name in TRAIN]
     result, seconds = found_in(model, records, options.budget)
-    final = result.extended.model
+    final = result.model
     refit = fit_by_torque(final, sets[TRAIN])
     say(_row('ours, with causes', relative(final.with_values(refit.values), sets[HELD])))
     say(f'\nCPU: least squares {squares_seconds:.1f} s, torque fit {plain_seconds:.1f} s, '

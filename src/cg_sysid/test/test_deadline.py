@@ -18,12 +18,14 @@ from cg_dynamics.rig import Setup
 from cg_sysid import parallel
 from cg_sysid.cli import diagnose as diagnose_cli
 from cg_sysid.deadline import Deadline, OutOfTime, check_time
-from cg_sysid.diagnosis.diagnose import Options, diagnose
+from cg_sysid.diagnosis import conclude
+from cg_sysid.diagnosis.conclude import LAST_FIT
+from cg_sysid.diagnosis.diagnose import Options, diagnose, led_in
 from cg_sysid.diagnosis.early_end import answer_so_far
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import identify, kept_fits
 from cg_sysid.identification.data_set import prepare
-from cg_sysid.identification.identify import fit
+from cg_sysid.identification.identify import fit, score
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.search.task import Task
 from cg_sysid.search.whole_fit import try_candidate
@@ -155,6 +157,37 @@ def test_what_was_fitted_is_judged(delayed):
     assert any('doubt' in step for step in found.unfinished.steps)
     hip = next(gain for gain in found.gains if gain.channel == 'hip_angle')
     assert hip.after < 0.5 * hip.before
+
+
+def test_numbers_of_the_model_are_those_of_all_records(delayed):
+    """What judges is held out until the answer stands; whoever simulates gets what all say."""
+    model, records = delayed
+    found = diagnose(model, records, Options(effects=('sensor_delay',), workers=0))
+    assert found.from_all
+    assert found.unfinished is None
+    both = [led_in(data_set) for data_set in prepare(model, records)]
+    (name,) = (n for n in found.model.quantities if n.endswith('.delay'))
+    judged, given = (m.quantities[name] for m in (found.extended.train.model, found.model))
+    assert given.value == pytest.approx(0.012, abs=5 * given.tolerance)
+    # Twice the records leave at most the root of a half of the uncertainty, and the second one
+    # moves faster.
+    assert given.tolerance < 0.75 * judged.tolerance
+    left, with_half = (score(m, both).squares for m in (found.model, found.extended.train.model))
+    assert left < with_half
+
+
+def test_without_time_for_the_last_fit_the_model_has_numbers_of_training(delayed, monkeypatch):
+    def over(*_):
+        raise OutOfTime
+
+    monkeypatch.setattr(conclude, 'fitted_to_all', over)
+    model, records = delayed
+    found = diagnose(model, records, Options(effects=('sensor_delay',), workers=0))
+    assert found.verdict == 'explained'
+    assert found.unfinished.steps == (LAST_FIT,)
+    assert LAST_FIT in found.summary
+    assert not found.from_all
+    assert found.model.values == found.extended.train.model.values
 
 
 def test_a_trial_without_small_faults_is_no_answer_where_it_leaves_more(model_file):

@@ -211,6 +211,7 @@ def test_the_ground_is_named_in_a_robot_of_other_numbers(ground):
     assert abs(estimate - value) < 4 * spread + 0.01 * value
     assert (found.landings.after < found.landings.before).all()
     assert contact_law(found.extended.train.model) != ContactLaw()
+    assert contact_law(found.model) == contact_law(found.extended.train.model)
     facts = diagnosis_facts(found, Loaded(cut.records, (), cut.origin), {})
     page = card(facts)
     assert page.count('<circle') == 2 * len(facts['landings']['impulses']) > 0

@@ -285,13 +285,14 @@ def extended_model(answer: Diagnosis, facts: Facts) -> Model:
     """The model with the causes in it; its provenance says where it comes from."""
     origin = facts['provenance']
     return replace(
-        answer.extended.train.model,
+        answer.model,
         provenance={
             'made_by': 'diagnose',
             'created': origin['created'],
             'parent': Path(origin['model_file']).name,
             'parent_sha256': origin['model_sha256'],
             'verdict': str(answer.verdict),
+            'numbers_from': 'all records' if answer.from_all else 'the training records',
             'causes': [cause.label for cause in answer.causes],
             'records': [
                 {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']

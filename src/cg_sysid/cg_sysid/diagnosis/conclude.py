@@ -8,6 +8,7 @@ import numpy as np
 
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.errors import DynamicsError
+from cg_dynamics.model import Model
 from cg_interfaces.channels import interface
 from cg_sysid.deadline import OutOfTime
 from cg_sysid.diagnosis.between_recordings import Wandering
@@ -20,7 +21,9 @@ from cg_sysid.diagnosis.result import Cause, Diagnosis, Verdict, gains_of
 from cg_sysid.diagnosis.small_faults import shapes, told_small_faults, with_law
 from cg_sysid.diagnosis.summary import summary_of
 from cg_sysid.diagnosis.thorough import thorough
+from cg_sysid.diagnosis.ties import fitted_to_all
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.errors import Failure
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.measured_start import MeasuredStart, judged
 from cg_sysid.identification.unknowns import IdentificationError
@@ -29,12 +32,13 @@ from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search import settings
 from cg_sysid.search.model_selection import above_noise, at_noise, share_explained
 from cg_sysid.search.outcome import Outcome, chi2, prior_conflicts
-from cg_sysid.search.standings import Unfinished
+from cg_sysid.search.standings import Unfinished, left_undone
 from cg_sysid.search.starts import started_from
 from cg_sysid.search.task import Task
 
 log = logging.getLogger(__name__)
 
+LAST_FIT = 'the last fit, to all records'
 TURNS = 3  # periods that a term of a short stretch of an angle is tried with
 
 
@@ -65,7 +69,26 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
         late = told_late_samples(work, gained(work, nominal, final))
     if late:
         verdict = Verdict.UNEXPLAINED
-    return answer(work, nominal, final, causes, verdict, unmodelled, wandering, late)
+    try:
+        model, unfinished = from_all_records(work, final), None
+    except OutOfTime:
+        model, unfinished = None, left_undone(work.deadline, LAST_FIT)
+    return answer(
+        work, nominal, final, causes, verdict, unmodelled, wandering, late, unfinished, model
+    )
+
+
+def from_all_records(work: Workspace, final: Outcome) -> Model | None:
+    """What was found with numbers from all records, those held out among them; None without.
+
+    Errors are told of a fit that has not seen what judges it. Whoever simulates the machine wants
+    what all of its records say.
+    """
+    fitted = fitted_to_all(work, final)
+    if isinstance(fitted, Failure):
+        log.info('no fit to all records: %s', fitted.reason)
+        return None
+    return fitted.model
 
 
 def relative(work: Workspace, nominal: Outcome, term: Unmodelled | None) -> Outcome | None:
@@ -185,8 +208,9 @@ def answer(
     wandering: Wandering | None = None,
     late: str = '',
     unfinished: Unfinished | None = None,
+    model: Model | None = None,
 ) -> Diagnosis:
-    """Put together what was found."""
+    """Put together what was found; without a `model` from all records, that of training stands."""
     gains = gained(work, nominal, final)
     reference = work.selection.judge(nominal, nominal, 0.0)
     extended = work.selection.judge(nominal, final, sum(c.evidence for c in causes))
@@ -217,6 +241,8 @@ def answer(
         late=late,
         unfinished=unfinished,
         measured_start=measured_start,
+        model=model or final.train.model,
+        from_all=model is not None,
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
 from cg_sysid.search import settings
-from cg_sysid.search.standings import Unfinished
+from cg_sysid.search.standings import left_undone
 from cg_sysid.search.task import Task
 from cg_sysid.stances.held_foot import held_by_friction
 from cg_sysid.stances.phases import Landing, cut_steps
@@ -166,9 +166,11 @@ def diagnose(
 
 def broken_off(found: Diagnosis, deadline: Deadline, step: str) -> Diagnosis:
     """The diagnosis, marked as one that the deadline kept from one more step."""
-    before = found.unfinished or Unfinished(deadline.why, deadline.passed, (), (), (), ())
-    marked = replace(before, steps=(*before.steps, step))
-    summary = found.summary.removesuffix(f' {before.text}')
+    before = found.unfinished
+    marked = (
+        replace(before, steps=(*before.steps, step)) if before else left_undone(deadline, step)
+    )
+    summary = found.summary.removesuffix(f' {before.text}') if before else found.summary
     return replace(found, unfinished=marked, summary=f'{summary} {marked.text}')
 
 

@@ -50,6 +50,7 @@ def with_landings(
         summary=f'{answer.summary} {words(answer, found)}',
         causes=tuple(sorted(causes, key=lambda cause: -cause.evidence)),
         extended=replace(extended, model=model, train=replace(extended.train, model=model)),
+        model=_with_law(answer.model, found),
         landings=found,
     )
 

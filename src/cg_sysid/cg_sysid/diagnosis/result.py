@@ -97,6 +97,10 @@ class Diagnosis:
         late: What errors of timing make of an error that stays unexplained, as a sentence; empty
             where there are none.
         unfinished: What an early end left undone; None for a whole search.
+        model: What was found, for whoever simulates: the extended model with numbers from all
+            records, those held out among them.
+        from_all: False where there was no time for that fit, and `model` has the numbers of the
+            training records.
         measured_start: The gain where held-out records start at measured angles; None where no
             cause is named, or their starts carry nowhere.
     """
@@ -112,6 +116,8 @@ class Diagnosis:
     train: tuple[DataSet, ...]
     held: tuple[DataSet, ...]
     remaining: dict[str, float]
+    model: Model
+    from_all: bool
     findings: tuple[str, ...] = ()
     unmodelled: Unmodelled | None = None
     landings: Landings | None = None

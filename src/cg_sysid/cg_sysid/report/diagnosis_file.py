@@ -96,6 +96,10 @@ def diagnosis_facts(
             'unfinished': _unfinished(diagnosis),
             'ranking': [*(_round(r) for r in diagnosis.rounds), *_laws(diagnosis)],
             **_fitted(diagnosis.nominal, fit),
+            'delivered': {
+                'from_all': diagnosis.from_all,
+                'values': {u.name: diagnosis.model.values[u.name] for u in fit.unknowns},
+            },
             'findings': list(diagnosis.findings),
             **_data(diagnosis.nominal, data_sets, roles, errors, counts, loaded),
             'provenance': dict(provenance),
@@ -121,6 +125,7 @@ def unusable_facts(
             'gain': {},
             'gain_from_measured_start': None,
             'remaining_error': {},
+            'delivered': None,
             'unmodelled': None,
             'wandering': None,
             'late_samples': '',
@@ -192,6 +197,7 @@ def identification_facts(
                 for (channel, _), a, n in zip(outputs, after, total, strict=True)
                 if n
             },
+            'delivered': None,
             'unmodelled': None,
             'wandering': None,
             'late_samples': '',

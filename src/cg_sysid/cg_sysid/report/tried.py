@@ -132,12 +132,16 @@ def parameters(facts: Facts) -> Markup | None:
         'Identified parameters',
         tag('table', tag('thead', head), tag('tbody', [_row(p) for p in moved])),
     )
+    from_all = (facts.get('delivered') or {}).get('from_all')
     return tag('section',
         tag('h2', 'Parameters', id='parameters-title'),
         tag('p', 'The grey band is what the model file believes, one tolerance either way; the '
             'dot is the identified value, the bar its 95 % interval. The last column says how '
             'much of the certainty comes from the recordings rather than from the file.',
             class_='soft') if moved else None,
+        tag('p', 'Errors and evidence are those of these values, which have not seen what judges '
+            'them. Those of model.yaml come from a last fit to all recordings.',
+            class_='soft') if moved and from_all else None,
         table if moved else None,
         tag('details', tag('summary', f'{len(fixed)} held fixed'),
             wide('Fixed parameters', _fixed_table(fixed)))

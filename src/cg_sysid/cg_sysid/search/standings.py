@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from cg_sysid.deadline import Deadline
 from cg_sysid.search.look import Screening
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.outcome import Outcome
@@ -74,6 +75,11 @@ class Unfinished:
             if labels
         ]
         return f'{text} Not done: {"; ".join([*missing, *self.steps])}.'
+
+
+def left_undone(deadline: Deadline, step: str) -> Unfinished:
+    """A search that its deadline kept from this step alone."""
+    return Unfinished(deadline.why, deadline.passed, (), (), (), (step,))
 
 
 class SoFar:
