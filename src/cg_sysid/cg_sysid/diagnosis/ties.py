@@ -30,12 +30,14 @@ def tie(work: Workspace, comparison: Comparison, label: str) -> Comparison | Non
     )
 
 
-def fitted_to_all(work: Workspace, o: Outcome) -> Fit | Failure:
+def fitted_to_all(
+    work: Workspace, o: Outcome, iterations: int = settings.FITTING.thorough_iterations
+) -> Fit | Failure:
     """A thorough fit of an outcome's structure to all records, or why there is none."""
     key = structure(o)
     if key not in work.joint:
         title = f'{title_of(work.added(o))} on all records'
-        found = work.carry_out(fit_to_all, [(o, (*work.train, *work.held))], title)[0]
+        found = work.carry_out(fit_to_all, [(o, (*work.train, *work.held), iterations)], title)[0]
         work.joint[key] = found
     return work.joint[key]
 

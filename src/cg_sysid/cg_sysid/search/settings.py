@@ -49,11 +49,14 @@ class Fitting:
 
     Attributes:
         iterations: Of a fit by itself.
-        thorough_iterations: Of the last fit of what was found.
+        thorough_iterations: Of the thorough fit of what was found.
+        last_iterations: From there on all records. One step of Gauss-Newton would be as good as
+            what they know, were the cost quadratic that far.
     """
 
     iterations: int = 60
     thorough_iterations: int = 72
+    last_iterations: int = 8
 
 
 @dataclass(frozen=True)

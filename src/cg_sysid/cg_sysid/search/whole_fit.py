@@ -61,7 +61,11 @@ def try_candidate(
     )  # fmt: skip
 
 
-def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
+def fit_to_all(
+    o: Outcome,
+    data_sets: Sequence[DataSet],
+    iterations: int = settings.FITTING.thorough_iterations,
+) -> Fit | Failure:
     """A thorough fit of an outcome's structure to all records, those held out among them.
 
     Rivals that have earned their place on held-out records are told apart by this: values that
@@ -70,6 +74,7 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
     Args:
         o: The outcome to go on from.
         data_sets: Those of its training, then those held out.
+        iterations: At most.
     """
     both = replace(o.train, motions=(*o.train.motions, *o.held.motions))
     start = started_from(both, o.model, o.task.bounds)
@@ -81,7 +86,7 @@ def fit_to_all(o: Outcome, data_sets: Sequence[DataSet]) -> Fit | Failure:
             own=o.events,
             bounds=o.task.bounds,
             thorough=True,
-            iterations=settings.FITTING.thorough_iterations,
+            iterations=iterations,
         )
     except (IdentificationError, DynamicsError, np.linalg.LinAlgError) as error:
         return Failure(str(error))
