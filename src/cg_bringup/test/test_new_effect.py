@@ -19,7 +19,7 @@ from cg_sysid.checks.loading import Loaded
 from cg_sysid.cli.diagnose import diagnosis_curves
 from cg_sysid.provenance import provenance
 from cg_sysid.report import render
-from cg_sysid.report.diagnosis_file import diagnosis_facts
+from cg_sysid.report.facts import diagnosis_facts
 
 SPRINGS = tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3))
 RIVAL = 'ground_slope'

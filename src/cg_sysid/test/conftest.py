@@ -14,7 +14,7 @@ from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.provenance import provenance
 from cg_sysid.records.bags import write_bag
-from cg_sysid.report.diagnosis_file import diagnosis_facts
+from cg_sysid.report.facts import diagnosis_facts
 
 BIAS = 0.8  # N m, hidden in the machine
 EFFECTS = ('torque_bias', 'quadratic_friction')

@@ -17,7 +17,7 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.unknowns import own_unknowns
-from cg_sysid.report.diagnosis_file import diagnosis_facts
+from cg_sysid.report.facts import diagnosis_facts
 
 SETUP = Setup(springs=tuple(Spring('inner', 1.0, (x, 1.0), 200.0, 0.5) for x in (1.3, -1.3)))
 EFFECTS = 'ground_slope', 'quadratic_friction', 'external_push'

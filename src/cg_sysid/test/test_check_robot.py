@@ -18,7 +18,7 @@ from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.experiments.synthetic import Synthesis, synthesise
 from cg_sysid.records.bags import read_bag, to_record, write_bag
-from cg_sysid.report.diagnosis_file import unusable_facts
+from cg_sysid.report.facts import unusable_facts
 from cg_sysid.report.page import render
 
 MODEL = model_path('compass_gait_mit')

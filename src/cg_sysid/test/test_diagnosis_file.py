@@ -10,7 +10,8 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_sysid.report import curves
-from cg_sysid.report.diagnosis_file import interval, plain, read_facts, unusable_facts, write_facts
+from cg_sysid.report.diagnosis_file import plain, read_facts, write_facts
+from cg_sysid.report.facts import interval, unusable_facts
 
 DOCS = Path(__file__).parents[3] / 'docs/reference/diagnosis_json.md'
 

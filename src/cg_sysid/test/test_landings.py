@@ -27,7 +27,7 @@ from cg_sysid.landings.impulse import measure_impulse
 from cg_sysid.landings.landings import ready, simulate_passage
 from cg_sysid.landings.selection import judge_landings
 from cg_sysid.records.record import Record
-from cg_sysid.report.diagnosis_file import diagnosis_facts
+from cg_sysid.report.facts import diagnosis_facts
 from cg_sysid.report.landings import landings as card
 from cg_sysid.report.wording import lead
 from cg_sysid.stances.phases import cut_steps

@@ -19,7 +19,7 @@ from cg_sysid.identification.identify import fit
 from cg_sysid.provenance import provenance
 from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.report import render
-from cg_sysid.report.diagnosis_file import diagnosis_facts
+from cg_sysid.report.facts import diagnosis_facts
 from cg_sysid.report.signals import payload
 
 

@@ -36,7 +36,8 @@ from cg_sysid.experiments.catalogue import experiments_for
 from cg_sysid.progress import Bars
 from cg_sysid.provenance import provenance
 from cg_sysid.report import curves, write_report
-from cg_sysid.report.diagnosis_file import Facts, diagnosis_facts, unusable_facts, write_facts
+from cg_sysid.report.diagnosis_file import Facts, write_facts
+from cg_sysid.report.facts import diagnosis_facts, unusable_facts
 
 MODEL = 'model.yaml'
 LEARNED = 'learned.yaml'

@@ -28,7 +28,8 @@ from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.progress import Bars
 from cg_sysid.provenance import provenance
 from cg_sysid.report import curves, write_report
-from cg_sysid.report.diagnosis_file import Facts, identification_facts, write_facts
+from cg_sysid.report.diagnosis_file import Facts, write_facts
+from cg_sysid.report.facts import identification_facts
 from cg_sysid.text import measured, number, plain_unit
 
 METHODS: dict[str, Callable[..., Fit]] = {'gauss_newton': fit, 'nelder_mead': nelder_mead}

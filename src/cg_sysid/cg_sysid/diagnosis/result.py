@@ -1,7 +1,7 @@
 """The answer of a diagnosis as data.
 
 What was found, what was tried, and the gain; how it is found is in diagnose.py, how it is told in
-summary.py, how it is written to disk in report/diagnosis_file.py.
+summary.py, how it becomes plain data in report/facts.py.
 """
 
 from collections.abc import Mapping, Sequence

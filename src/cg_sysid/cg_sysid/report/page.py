@@ -45,7 +45,7 @@ def render(facts: Facts, curves: Sequence[Curve], faults: Sequence[FaultSignal] 
     """The page as text.
 
     Args:
-        facts: As diagnosis_file.py builds them.
+        facts: As facts.py builds them.
         curves: Measured and simulated signals, those that judge first; may be empty.
         faults: Signals around the faults of broken recordings.
     """
