@@ -14,8 +14,8 @@ import numpy as np
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
-from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.measured_motion import motion_of
 
 CONDITION = 1e-8  # of singular values that count, of the largest
 TURNING = 0.01  # rad/s or m/s, over which dry friction turns
@@ -61,7 +61,7 @@ def least_squares(
 
     def system(data_sets: Sequence[DataSet]) -> tuple[np.ndarray, np.ndarray]:
         """Torques by each number, (rows, joints, numbers), and torques, (rows, joints)."""
-        motions = [torque_error.motion_of(model, d, body.inputs) for d in data_sets]
+        motions = [motion_of(model, d, body.inputs) for d in data_sets]
         place, rate, acceleration, inputs = (
             np.vstack([getattr(m, name) for m in motions if m is not None])
             for name in ('position', 'rate', 'acceleration', 'inputs')

@@ -15,16 +15,12 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
+from cg_sysid.identification.student_t import SCALED, TAILS, deviance, row_scale, scale_of
 from cg_sysid.identification.torque_error import (
-    SCALED,
-    TAILS,
     can,
-    deviance,
     fit_by_torque,
     fits_by_torque,
     problems_of,
-    row_scale,
-    scale_of,
 )
 from cg_sysid.identification.windows import followed
 from cg_sysid.search import look

@@ -9,19 +9,10 @@ motion where their joint and its motor are all that moves them (along_motion.py)
 elsewhere. So it says where a fit by simulation error sets out, and which candidates are worth one
 (theory.md, "Torque error").
 
-Position, rate and acceleration come from local polynomials. Torques are averaged with the weights
-with which such an acceleration averages the true one, so that both sides have seen the same: of a
-constant inertia (TE) is exact, however fast it moves.
-
-Where friction turns within a window a row is far off, so rows are distributed as Student's t
-
-    -2 log L = sum (nu + 1) log(1 + (r/s)^2 / nu) + 2 log s,   nu = 4                          (T)
-
-with s, one for each coordinate, the most likely: a fit is ranked by what it leaves, and by no
-weights that another has chosen.
+Where friction turns within a window of the measured motion (measured_motion.py) a row is far off,
+so rows are distributed as Student's t (student_t.py).
 """
 
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,18 +24,15 @@ from cg_dynamics.effects import Effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.identification import along_motion
-from cg_sysid.identification.along_motion import AlongMotion, Samples
+from cg_sysid.identification.along_motion import AlongMotion
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.hope import out_of_reach
+from cg_sysid.identification.measured_motion import Motion, motion_of
+from cg_sysid.identification.student_t import deviance, row_scale, scale_of
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
 
-HALF_WIDTH_S = 0.06  # of the window of a local polynomial: motions up to some 5 Hz
 SHORTER = 0.5  # times that and STRIDE_S where a rotor moves by itself, which it does faster
 ENOUGH_S = 10.0  # of all records together, to be followed by a rotor
-MOVING_S = 0.01  # half width of the window of the motion that moves a rotor
-LEAST_HALF_WIDTH = 3  # samples
-DEGREE = 4  # of the polynomial
-STRIDE_S = 0.04  # between rows: windows that share less than half of their samples
 ITERATIONS = 25
 HEAT = 6  # iterations from each of many starts, before the best of them go on
 SETTLED = 1e-4  # of the deviance, for each residual
@@ -52,32 +40,6 @@ DAMPING = 1e-3  # Levenberg-Marquardt, at first
 MOST_DAMPING = 1e6
 PATIENCE = 4  # steps that may gain little where a full one promises more
 STRAINED = 2.5  # tolerances that a value lies off its belief
-RUN_AWAY = 1e6  # standard deviations, in which no state is that moves with its joint
-TAILS = 4.0  # nu of (T)
-SCALED = 1e-3  # relative change of s at which it has settled
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What was measured of one data set, at rows STRIDE_S apart.
-
-    Attributes:
-        position: Free coordinates, shape (k, m).
-        rate: Shape (k, m).
-        acceleration: Shape (k, m).
-        inputs: Averages, shape (k, nu).
-        first: Rows with which a record begins, shape (k,).
-        setup: The set-up.
-        records: All samples, record by record.
-    """
-
-    position: np.ndarray
-    rate: np.ndarray
-    acceleration: np.ndarray
-    inputs: np.ndarray
-    first: np.ndarray
-    setup: Setup
-    records: tuple[Samples, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -106,95 +68,6 @@ def can(model: Model) -> bool:
     """
     encoders = sum(kind == 'encoder' for kind in model.mechanism.sensor_kinds.values())
     return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
-
-
-def motion_of(
-    model: Model,
-    data_set: DataSet,
-    names: Sequence[str],
-    shorter: float = 1.0,
-    longest: float = np.inf,
-) -> Motion | None:
-    """The measured motion of a data set; None where it is too short or samples are missing.
-
-    Args:
-        model: Its mechanism counts.
-        data_set: The record.
-        names: Inputs wanted.
-        shorter: Times the usual windows.
-        longest: Only so much of the record, s.
-    """
-    body = model.mechanism
-    kinematics = body.kinematics(data_set.setup)
-    basis = np.asarray(kinematics.basis)
-    offset = np.broadcast_to(np.asarray(kinematics.offset).ravel(), (len(basis),))
-    count = len(body.coordinates)
-    seen = data_set.outputs[:, :count]
-    spacing = float(np.median(np.diff(data_set.time)))
-    half = max(LEAST_HALF_WIDTH, round(shorter * HALF_WIDTH_S / spacing))
-    grid = np.arange(0.0, min(data_set.duration, longest), spacing)
-    if len(grid) <= 2 * half + 1:
-        return None
-    place, rate, acceleration = (_weights(half, spacing, order) for order in range(3))
-    held = _held(half, spacing)
-    stride = max(1, round(shorter * STRIDE_S / spacing))
-    free = np.linalg.pinv(basis)
-    angles = []
-    for channel in seen.T:
-        there = np.isfinite(channel)
-        if there.sum() <= 2 * half + 1:
-            return None
-        angles.append(np.interp(grid, data_set.time[there], channel[there]))
-    s = (np.column_stack(angles) - offset) @ free.T
-    row = np.clip(np.searchsorted(data_set.time, grid, side='right') - 1, 0, None)
-    inputs = data_set.inputs_for(names)[row]
-
-    def over(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        columns = [np.correlate(column, weights, 'valid')[::stride] for column in values.T]
-        return np.column_stack(columns)
-
-    position = over(s, place)
-    return Motion(
-        position, over(s, rate), over(s, acceleration), over(inputs, held),
-        np.arange(len(position)) == 0, data_set.setup,
-        (_samples(s, inputs, spacing, held, stride),),
-    )  # fmt: skip
-
-
-def _samples(
-    s: np.ndarray, inputs: np.ndarray, spacing: float, weights: np.ndarray, stride: int
-) -> Samples:
-    """All samples of a motion, smoothed as little as its rates allow."""
-    half = max(LEAST_HALF_WIDTH, round(MOVING_S / spacing))
-
-    def along(order: int) -> np.ndarray:
-        own = _weights(half, spacing, order)
-        columns = [np.correlate(column, own, 'valid') for column in s.T]
-        return np.pad(np.column_stack(columns), ((half, half), (0, 0)), 'edge')
-
-    return Samples(along(0), along(1), inputs, spacing, weights, stride)
-
-
-@functools.cache
-def _weights(half: int, spacing: float, order: int) -> np.ndarray:
-    """Weights of samples that give a derivative at the middle of a local polynomial."""
-    t = np.arange(-half, half + 1) * spacing
-    design = np.vander(t / t[-1], DEGREE + 1, increasing=True)
-    factor = (1.0, 1.0, 2.0)[order] / t[-1] ** order
-    return factor * np.linalg.pinv(design)[order]
-
-
-@functools.cache
-def _held(half: int, spacing: float) -> np.ndarray:
-    """Weights of what is held from each sample to the next, beside an acceleration of `_weights`.
-
-    That is a sum of second differences, with other weights: those are its weights summed twice. A
-    second difference of positions is an average of the acceleration over two intervals, to which
-    each of them contributes one half.
-    """
-    summed = np.cumsum(np.cumsum(_weights(half, spacing, 2))) * spacing**2
-    of_differences = np.concatenate([[0.0], summed[:-1], [0.0]])
-    return (of_differences[:-1] + of_differences[1:]) / 2
 
 
 def fit_by_torque(
@@ -560,40 +433,6 @@ def _range(u: Unknown) -> tuple[float, float]:
     return u.to_coordinate(max(u.lower, 1e-300)), u.to_coordinate(u.upper)
 
 
-def spread_of(residual: np.ndarray) -> np.ndarray:
-    """Standard deviation of most of the rows, shape (m,)."""
-    return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
-
-
-def scale_of(residual: np.ndarray) -> np.ndarray:
-    """The most likely s of (T), shape (m,): each step of this makes it more likely."""
-    scale = spread_of(residual)
-    if not np.isfinite(residual).all():
-        return scale
-    settled = False
-    while not settled:
-        rows = residual / row_scale(residual, scale)
-        new = np.maximum(scale * np.sqrt(np.mean(rows**2, axis=0)), 1e-12)
-        settled, scale = bool((np.abs(new - scale) < SCALED * scale).all()), new
-    return scale
-
-
-def row_scale(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """By what to divide each residual, that least squares descend (T), shape (rows, m)."""
-    return scale * np.sqrt((TAILS + (residual / scale) ** 2) / (TAILS + 1))
-
-
-def deviance(residual: np.ndarray) -> float:
-    """(T) at its most likely s, but for a constant."""
-    scale = scale_of(residual)
-    with np.errstate(invalid='ignore'):
-        size = np.abs(residual / scale)
-    if not np.all(size < RUN_AWAY):
-        return np.inf
-    each = (TAILS + 1) * np.log1p(size**2 / TAILS)
-    return float(each.sum() + 2 * len(residual) * np.log(scale).sum())
-
-
 def apart(model: Model) -> tuple[Model, tuple[Effect, ...]]:
     """A model without states, and of its effects those that are followed along a motion."""
     followed = tuple(e for e in acting_effects(model) if along_motion.follows(e))
@@ -620,12 +459,3 @@ def without_states(model: Model) -> Model:
             if all(e.label != f'{name}@{effect.at}' and e.name != name for e in model.effects):
                 model = model.with_effect(name, effect.at, **values)
     return model
-
-
-def noise_gains(spacing: float) -> tuple[float, float, float]:
-    """Noise of position, rate and acceleration over that of a sample, 1, 1/s and 1/s^2."""
-    half = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
-    place, rate, acceleration = (
-        float(np.linalg.norm(_weights(half, spacing, order))) for order in range(3)
-    )
-    return place, rate, acceleration

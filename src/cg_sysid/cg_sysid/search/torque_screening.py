@@ -35,7 +35,9 @@ from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.torque_error import Motion, Problem, TorqueFit
+from cg_sysid.identification.measured_motion import STRIDE_S, Motion, noise_gains
+from cg_sysid.identification.student_t import row_scale, spread_of
+from cg_sysid.identification.torque_error import Problem, TorqueFit
 from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search.nuisance import Bounds
@@ -151,7 +153,7 @@ def scores(
     residual = torque_error.residuals(problems, unknowns, theta)
     jacobian = torque_error.derivatives(problems, unknowns, theta)
     # Few rows are far off, where friction turns within a window: they count less, as in fits.
-    scale = torque_error.row_scale(residual, fitted.scale)
+    scale = row_scale(residual, fitted.scale)
     known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
     # The belief is as good as measurements of the numbers themselves.
     belief = np.diag(1 / tolerance)
@@ -284,7 +286,7 @@ def _pushed(
     first = np.concatenate([motion.first for motion in motions])
     error = np.where(_beginning(first)[:, None], 0.0, error)
     settled = _beyond_friction(model, error, rates, free)
-    spread = torque_error.spread_of(error)  # a push is far off, and counts in full
+    spread = spread_of(error)  # a push is far off, and counts in full
     about = {c: _about(model, c, free) for c in candidates}
     clear, every = (
         {c: _gains((rows / spread)[:, joints]) for c, joints in about.items()}
@@ -474,7 +476,7 @@ def _one_column(model: Model, label: str, problem: Problem, by_motion: np.ndarra
 
 def _rise(values: np.ndarray, motion: Motion) -> np.ndarray:
     """Derivative by time along rows, where they follow each other."""
-    rise = np.gradient(values, torque_error.STRIDE_S, axis=0)
+    rise = np.gradient(values, STRIDE_S, axis=0)
     rise[motion.first] = 0.0
     rise[:-1][motion.first[1:]] = 0.0
     return rise
@@ -501,7 +503,7 @@ def _noise(data_set: DataSet, by_motion: Sequence[np.ndarray]) -> np.ndarray:
     m = by_motion[0].shape[1]
     sigma = data_set.sigma[:m]
     spacing = float(np.median(np.diff(data_set.time)))
-    gains = torque_error.noise_gains(spacing)
+    gains = noise_gains(spacing)
     spread = np.concatenate([gain * sigma for gain in gains])
     return np.sqrt(np.mean(np.vstack([(b**2) @ spread**2 for b in by_motion]), axis=0))
 
