@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from cg_bringup.balancing import BalanceRun, balance, power_above
-from cg_control.balance import BalanceController, BalanceSettings, balance_gains
-from cg_control.basin import shipped_basins
+from cg_control.balancing.balance import BalanceController, BalanceSettings, balance_gains
+from cg_control.balancing.basin import shipped_basins
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

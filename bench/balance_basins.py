@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.basin import sample_basin
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.balancing.basin import sample_basin
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from cg_bringup.balancing import balance, record_of
-from cg_control.balance import BalanceController, BalanceSettings, balance_gains
+from cg_control.balancing.balance import BalanceController, BalanceSettings, balance_gains
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

@@ -12,11 +12,11 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from cg_control.collocation import planning_model
+from cg_control.following.nodes import Nodes
+from cg_control.following.tracking import LEAST_TURN, TrackingSettings
 from cg_control.friction import friction_parameters, friction_torque
-from cg_control.nodes import Nodes
-from cg_control.tracking import LEAST_TURN, TrackingSettings
-from cg_control.virtual_constraints import VirtualConstraints
+from cg_control.orbits.virtual_constraints import VirtualConstraints
+from cg_control.trajectories.collocation import planning_model
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup

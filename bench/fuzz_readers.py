@@ -43,11 +43,11 @@ import scipy.io
 import yaml
 
 from cg_bringup.hidden import hidden_effects_file
-from cg_control.basin import SHIPPED, shipped_file
-from cg_control.nodes import Nodes
-from cg_control.trajectory import Trajectory, TrajectoryError
-from cg_control.tree import Tree, TreeError
-from cg_control.tree_files import TreeSelection
+from cg_control.balancing.basin import SHIPPED, shipped_file
+from cg_control.following.nodes import Nodes
+from cg_control.trajectories.trajectory import Trajectory, TrajectoryError
+from cg_control.trees.tree import Tree, TreeError
+from cg_control.trees.tree_files import TreeSelection
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path, models_directory
 from cg_description.reading import DocumentError, parse_yaml, read_text

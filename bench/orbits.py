@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from cg_control.collocation import PlanningError
-from cg_control.floquet import multipliers
-from cg_control.orbit import Orbit, plan_orbit
-from cg_control.orbit_library import OrbitLibrary, orbit_library
+from cg_control.orbits.floquet import multipliers
+from cg_control.orbits.orbit import Orbit, plan_orbit
+from cg_control.orbits.orbit_library import OrbitLibrary, orbit_library
+from cg_control.trajectories.collocation import PlanningError
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

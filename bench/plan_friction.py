@@ -24,11 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_control import collocation
-from cg_control.collocation import Options, PlanningError, optimise, planning_model
 from cg_control.friction import friction_torque
-from cg_control.task import Box, Task
-from cg_control.trajectory import Trajectory
+from cg_control.trajectories import collocation
+from cg_control.trajectories.collocation import Options, PlanningError, optimise, planning_model
+from cg_control.trajectories.task import Box, Task
+from cg_control.trajectories.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

@@ -21,12 +21,12 @@ import casadi as ca
 import numpy as np
 from hidden_effects import PROGRAMME
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.collocation import Options, PlanningError
-from cg_control.planning import CheckOptions, executed, plan
-from cg_control.task import Task
-from cg_control.tracking import REMEDIES, TrackingSettings
-from cg_control.trajectory import Trajectory
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.following.planning import CheckOptions, executed, plan
+from cg_control.following.tracking import REMEDIES, TrackingSettings
+from cg_control.trajectories.collocation import Options, PlanningError
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model

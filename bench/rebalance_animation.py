@@ -7,8 +7,8 @@ import numpy as np
 from animation import COLOURS, Motion, save, stage
 from rebalance import OPTIONS, ROBOT, planned
 
-from cg_control.planning import executed
-from cg_control.tracking import TrackingSettings
+from cg_control.following.planning import executed
+from cg_control.following.tracking import TrackingSettings
 from cg_dynamics.rig import STANCES
 
 START = np.array([0.02, -0.08, 0.05, 0.1])

@@ -26,11 +26,11 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from cg_control.collocation import Options, optimise, planning_model, screen
-from cg_control.linearise import design_model
-from cg_control.program import GUESSES, Program
-from cg_control.task import Box, Task
-from cg_control.tvlqr import Weights, balance_regulator, linearised, riccati
+from cg_control.balancing.linearise import design_model
+from cg_control.trajectories.collocation import Options, optimise, planning_model, screen
+from cg_control.trajectories.program import GUESSES, Program
+from cg_control.trajectories.task import Box, Task
+from cg_control.trajectories.tvlqr import Weights, balance_regulator, linearised, riccati
 from cg_description.paths import model_path
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.model import Model

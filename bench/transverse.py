@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_control.collocation import planning_model
-from cg_control.orbit import plan_orbit
-from cg_control.surfaces import METHODS, UNITS, phase_of, tube, with_surfaces
-from cg_control.transverse import TRANSVERSE, monodromy, stabilise_transversely
-from cg_control.tvlqr import Weights, stabilise
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.orbits.surfaces import METHODS, UNITS, phase_of, tube, with_surfaces
+from cg_control.orbits.transverse import TRANSVERSE, monodromy, stabilise_transversely
+from cg_control.trajectories.collocation import planning_model
+from cg_control.trajectories.tvlqr import Weights, stabilise
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.walking.hybrid import WalkOptions, walk

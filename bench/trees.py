@@ -25,16 +25,16 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from cg_control.collocation import Options, PlanningError, optimise
-from cg_control.extension import Extension
+from cg_control.following.nodes import Nodes
+from cg_control.following.planning import plan
+from cg_control.following.tracking import REMEDIES, Tracker, TrackingSettings
 from cg_control.grow_tree import BOX, upright_tree
-from cg_control.growth import Region
-from cg_control.nodes import Nodes
-from cg_control.planning import plan
-from cg_control.rollouts import follow
-from cg_control.task import Box, Task
-from cg_control.tracking import REMEDIES, Tracker, TrackingSettings
-from cg_control.tvlqr import stabilise
+from cg_control.trajectories.collocation import Options, PlanningError, optimise
+from cg_control.trajectories.task import Box, Task
+from cg_control.trajectories.tvlqr import stabilise
+from cg_control.trees.extension import Extension
+from cg_control.trees.growth import Region
+from cg_control.trees.rollouts import follow
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

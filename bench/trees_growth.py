@@ -28,12 +28,12 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta
 
-from cg_control.extension import Extension
 from cg_control.grow_tree import BOX, CHAMPIONSHIP, GROWTH, REGION, SAMPLE, upright_tree
-from cg_control.growth import Grower, Region
-from cg_control.lookup import Lookup
-from cg_control.preview import CHAMPIONS, LANDING, Preview, champions, pruned
-from cg_control.tree import Tree
+from cg_control.trees.extension import Extension
+from cg_control.trees.growth import Grower, Region
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.preview import CHAMPIONS, LANDING, Preview, champions, pruned
+from cg_control.trees.tree import Tree
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

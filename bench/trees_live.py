@@ -20,12 +20,12 @@ from scipy.stats import beta
 
 from cg_bringup.balancing import BalanceRun, balance
 from cg_bringup.recover_run import RecoverOptions, start_of
-from cg_control.balance import BalanceController, BalanceSettings, balance_gains
-from cg_control.basin import shipped_basins
-from cg_control.preview import LANDING
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.balancing.balance import BalanceController, BalanceSettings, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.trees.preview import LANDING
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

@@ -29,8 +29,8 @@ from cg_bringup.balance_run import MACHINE
 from cg_bringup.recover_run import RecoverOptions, recover_nodes
 from cg_bringup.runs import MODES
 from cg_bringup.supervisor import supervised
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.model_file import write_atomically
 from cg_interfaces.domains import own_domain
 

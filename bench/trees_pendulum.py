@@ -26,11 +26,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from cg_control.growth import Grower, GrowthOptions, Region
-from cg_control.lookup import Lookup
-from cg_control.preview import AT_HOME
-from cg_control.rollouts import Outcome, follow
-from cg_control.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
+from cg_control.trees.growth import Grower, GrowthOptions, Region
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.preview import AT_HOME
+from cg_control.trees.rollouts import Outcome, follow
+from cg_control.trees.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

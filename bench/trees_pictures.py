@@ -27,13 +27,13 @@ from trees_pendulum import claims, grower
 
 from cg_bringup.recover_run import RecoverOptions
 from cg_control.grow_tree import BOX
-from cg_control.growth import in_coordinates
-from cg_control.lookup import Lookup
-from cg_control.preview import AT_HOME, LANDING, Preview
-from cg_control.recovery import ReadyTree
-from cg_control.rollouts import follow
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.trees.growth import in_coordinates
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.preview import AT_HOME, LANDING, Preview
+from cg_control.trees.recovery import ReadyTree
+from cg_control.trees.rollouts import follow
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_dynamics.rig import STANCES
 
 IMAGES = Path(__file__).parents[1] / 'docs' / 'images'

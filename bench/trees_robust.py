@@ -40,22 +40,22 @@ from trees_live import DURATION, EPSILONS, Known, came_home, share
 
 from cg_bringup.balancing import balance
 from cg_bringup.recover_run import RecoverOptions, start_of
-from cg_control.balance import (
+from cg_control.balancing.balance import (
     BALANCING,
     BalanceController,
     BalanceSettings,
     Command,
     balance_gains,
 )
-from cg_control.basin import sample_basin, shipped_basins
-from cg_control.collocation import Options
-from cg_control.execution import ExecutionSettings, TrajectoryController
-from cg_control.planning import plan
-from cg_control.preview import LANDING
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
-from cg_control.task import Task
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.balancing.basin import sample_basin, shipped_basins
+from cg_control.following.execution import ExecutionSettings, TrajectoryController
+from cg_control.following.planning import plan
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trees.preview import LANDING
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

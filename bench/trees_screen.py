@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta
 
-from cg_control.collocation import (
+from cg_control.trajectories.collocation import (
     ELASTIC_ITERATIONS,
     MISSED,
     Options,
@@ -34,9 +34,9 @@ from cg_control.collocation import (
     optimise,
     planning_model,
 )
-from cg_control.program import GUESSES, WEAK, Guess, Program
-from cg_control.reach import Screen, cheap
-from cg_control.task import Box, Task
+from cg_control.trajectories.program import GUESSES, WEAK, Guess, Program
+from cg_control.trajectories.reach import Screen, cheap
+from cg_control.trajectories.task import Box, Task
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES

@@ -31,14 +31,14 @@ import numpy as np
 from flock import SAMPLE_TIME, Flock, Physics, pushed, walked
 from walking_rivals import BOX, ROBOT, STEP, points, section, wrong_parameters
 
-from cg_control.balance import BALANCING, BalanceController, balance_gains
-from cg_control.basin import shipped_basins
-from cg_control.nodes import Way
-from cg_control.orbit import Orbit, plan_orbit
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
-from cg_control.tracking import Tracker
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.balancing.balance import BALANCING, BalanceController, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.following.nodes import Way
+from cg_control.following.tracking import Tracker
+from cg_control.orbits.orbit import Orbit, plan_orbit
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.model_file import write_atomically
 from cg_dynamics.rig import STANCES
 

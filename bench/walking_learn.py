@@ -21,14 +21,14 @@ from pathlib import Path
 import numpy as np
 
 from cg_bringup.balancing import BalanceRun, balance, record_of
-from cg_control.balance import BalanceController, balance_gains
-from cg_control.basin import sample_basin, shipped_basins
-from cg_control.collocation import PlanningError
+from cg_control.balancing.balance import BalanceController, balance_gains
+from cg_control.balancing.basin import sample_basin, shipped_basins
+from cg_control.following.tracking import WALKING
 from cg_control.plan_walk import walking_tree
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
-from cg_control.tracking import WALKING
-from cg_control.trajectory import TrajectoryError
-from cg_control.tree import Tree
+from cg_control.trajectories.collocation import PlanningError
+from cg_control.trajectories.trajectory import TrajectoryError
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

@@ -16,10 +16,10 @@ from matplotlib import pyplot
 from matplotlib.patches import Ellipse
 from trees_live import EPSILONS, MODEL, in_the_loop
 
-from cg_control.recovery import ReadyTree, RecoverySettings
-from cg_control.transverse import frame
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.orbits.transverse import frame
+from cg_control.trees.recovery import ReadyTree, RecoverySettings
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_dynamics.rig import STANCES
 
 IMAGES = Path(__file__).parents[1] / 'docs' / 'images'

@@ -40,16 +40,20 @@ import numpy as np
 from flock import Constrained, Flock, Following, Passive, Physics, pushed, walked
 from rebalance import wrong_robot
 
-from cg_control.nodes import Nodes
-from cg_control.orbit import Orbit, plan_orbit
-from cg_control.preview import Preview
-from cg_control.surfaces import with_surfaces
-from cg_control.tracking import LEAST_TURN, WALKING, Tracker, TrackingSettings
-from cg_control.transverse import stabilise_over_phase, stabilise_transversely, with_own_surfaces
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
-from cg_control.tvlqr import Weights, stabilise_periodically
-from cg_control.virtual_constraints import VirtualConstraints
+from cg_control.following.nodes import Nodes
+from cg_control.following.tracking import LEAST_TURN, WALKING, Tracker, TrackingSettings
+from cg_control.orbits.orbit import Orbit, plan_orbit
+from cg_control.orbits.surfaces import with_surfaces
+from cg_control.orbits.transverse import (
+    stabilise_over_phase,
+    stabilise_transversely,
+    with_own_surfaces,
+)
+from cg_control.orbits.virtual_constraints import VirtualConstraints
+from cg_control.trajectories.tvlqr import Weights, stabilise_periodically
+from cg_control.trees.preview import Preview
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

@@ -26,17 +26,17 @@ import numpy as np
 from flock import Flock, Following, Physics, walked
 from walking_rivals import ROBOT, STEP, STEPS, duration_of, section
 
-from cg_control.nodes import Nodes
-from cg_control.orbit import Orbit, plan_orbit
-from cg_control.surfaces import with_surfaces
-from cg_control.tracking import WALKING, TrackingSettings
-from cg_control.transverse import (
+from cg_control.following.nodes import Nodes
+from cg_control.following.tracking import WALKING, TrackingSettings
+from cg_control.orbits.orbit import Orbit, plan_orbit
+from cg_control.orbits.surfaces import with_surfaces
+from cg_control.orbits.transverse import (
     monodromy,
     stabilise_over_phase,
     stabilise_transversely,
     with_own_surfaces,
 )
-from cg_control.tvlqr import Weights, stabilise_periodically
+from cg_control.trajectories.tvlqr import Weights, stabilise_periodically
 from cg_dynamics.rig import STANCES
 
 SPEEDS = (0.25, 0.3, 0.35)

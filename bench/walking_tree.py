@@ -24,16 +24,16 @@ import numpy as np
 from trees_live import Known, share
 
 from cg_bringup.balancing import balance
-from cg_control.balance import BALANCING, BalanceController, balance_gains
-from cg_control.basin import shipped_basins
+from cg_control.balancing.balance import BALANCING, BalanceController, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.following.nodes import Way
+from cg_control.following.tracking import WALKING
 from cg_control.grow_tree import AROUND, REGION
-from cg_control.nodes import Way
-from cg_control.preview import LANDING, Preview
-from cg_control.recovery import FOLLOWING, ReadyTree, RecoverySettings, TreeController
-from cg_control.tracking import WALKING
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
-from cg_control.walking_region import OrbitPoints, WalkingRegion
+from cg_control.trees.preview import LANDING, Preview
+from cg_control.trees.recovery import FOLLOWING, ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
+from cg_control.walking.walking_region import OrbitPoints, WalkingRegion
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

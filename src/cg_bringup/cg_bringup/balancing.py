@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_control.balance import BALANCING, BalanceController
-from cg_control.recovery import TreeController
+from cg_control.balancing.balance import BALANCING, BalanceController
+from cg_control.trees.recovery import TreeController
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.plant import Plant

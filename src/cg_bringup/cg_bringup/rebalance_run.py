@@ -17,7 +17,7 @@ from cg_bringup.balance_run import MACHINE, carry_out
 from cg_bringup.balancing import FALLEN
 from cg_bringup.runs import MODES, PEERS, NodeOf
 from cg_bringup.verdict import rebalance_verdict
-from cg_control.tracking import REMEDIES
+from cg_control.following.tracking import REMEDIES
 from cg_description.paths import model_path
 from cg_dynamics.rig import STANCES
 from cg_interfaces import topics

@@ -14,7 +14,7 @@ from cg_bringup.launching import description, node_actions, number
 from cg_bringup.rebalance_run import RebalanceOptions, rebalance_nodes
 from cg_bringup.runs import MODES
 from cg_bringup.verdict import rebalance_verdict
-from cg_control.tracking import REMEDIES
+from cg_control.following.tracking import REMEDIES
 from cg_dynamics.rig import STANCES
 
 DEFAULT = RebalanceOptions()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cg_bringup.balancing import balance, power_above
-from cg_control.balance import BalanceController, BalanceSettings, balance_gains
-from cg_control.basin import shipped_basins
+from cg_control.balancing.balance import BalanceController, BalanceSettings, balance_gains
+from cg_control.balancing.basin import shipped_basins
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cg_control.trajectory import Trajectory
-from cg_control.tree_files import TreeSelection, tree_path, trees_directory
+from cg_control.trajectories.trajectory import Trajectory
+from cg_control.trees.tree_files import TreeSelection, tree_path, trees_directory
 from cg_description.paths import model_path, models_directory
 from cg_dynamics.model import Model
 from cg_hardware.simulation import read_setup

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from cg_bringup.balancing import balance, record_of
-from cg_control.balance import BalanceController, balance_gains
-from cg_control.basin import shipped_basins
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController
-from cg_control.tracking import WALKING
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.balancing.balance import BalanceController, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.following.tracking import WALKING
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant

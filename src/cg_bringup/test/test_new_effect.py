@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cg_control.linearise import linearise_stance
+from cg_control.balancing.linearise import linearise_stance
 from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import Effect, SensorEffect, StanceEffect

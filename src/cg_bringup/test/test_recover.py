@@ -14,15 +14,15 @@ from rclpy.parameter import Parameter  # noqa: E402
 from cg_bringup import recover_run  # noqa: E402
 from cg_bringup.balancing import balance  # noqa: E402
 from cg_bringup.recover_run import RecoverOptions, recover_nodes, start_of  # noqa: E402
-from cg_control.balance import BalanceController, balance_gains  # noqa: E402
-from cg_control.basin import shipped_basins  # noqa: E402
-from cg_control.lookup import Lookup  # noqa: E402
-from cg_control.preview import Preview  # noqa: E402
-from cg_control.recovery import ReadyTree, RecoverySettings, TreeController  # noqa: E402
-from cg_control.tree import Tree, TreeError  # noqa: E402
+from cg_control.balancing.balance import BalanceController, balance_gains  # noqa: E402
+from cg_control.balancing.basin import shipped_basins  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
-from cg_control.tree_files import tree_path  # noqa: E402
 from cg_control.tree_server_node import TreeServerNode  # noqa: E402
+from cg_control.trees.lookup import Lookup  # noqa: E402
+from cg_control.trees.preview import Preview  # noqa: E402
+from cg_control.trees.recovery import ReadyTree, RecoverySettings, TreeController  # noqa: E402
+from cg_control.trees.tree import Tree, TreeError  # noqa: E402
+from cg_control.trees.tree_files import tree_path  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.model import Model  # noqa: E402
 from cg_dynamics.plant import Plant  # noqa: E402

@@ -5,7 +5,7 @@ import pytest
 
 from cg_bringup.balancing import balance
 from cg_bringup.replay import main, replay_record
-from cg_control.balance import BalanceController, BalanceSettings, balance_gains
+from cg_control.balancing.balance import BalanceController, BalanceSettings, balance_gains
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant

@@ -14,19 +14,19 @@ from rclpy.parameter import Parameter  # noqa: E402
 from cg_bringup.balancing import balance  # noqa: E402
 from cg_bringup.verdict import walk_verdict  # noqa: E402
 from cg_bringup.walk_run import WalkRunOptions, walk_nodes  # noqa: E402
-from cg_control.balance import BALANCING, BalanceController, balance_gains  # noqa: E402
-from cg_control.basin import shipped_basins  # noqa: E402
-from cg_control.nodes import Way  # noqa: E402
-from cg_control.recovery import (  # noqa: E402
+from cg_control.balancing.balance import BALANCING, BalanceController, balance_gains  # noqa: E402
+from cg_control.balancing.basin import shipped_basins  # noqa: E402
+from cg_control.following.nodes import Way  # noqa: E402
+from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
+from cg_control.tree_server_node import TreeServerNode  # noqa: E402
+from cg_control.trees.recovery import (  # noqa: E402
     OUTSIDE,
     ReadyTree,
     RecoverySettings,
     TreeController,
 )
-from cg_control.tree import Tree, TreeError  # noqa: E402
-from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
-from cg_control.tree_files import tree_path  # noqa: E402
-from cg_control.tree_server_node import TreeServerNode  # noqa: E402
+from cg_control.trees.tree import Tree, TreeError  # noqa: E402
+from cg_control.trees.tree_files import tree_path  # noqa: E402
 from cg_description.paths import model_path  # noqa: E402
 from cg_dynamics.model import Model  # noqa: E402
 from cg_dynamics.plant import Plant  # noqa: E402

@@ -23,8 +23,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from cg_control.answer_age import AnswerAges
-from cg_control.balance import BALANCING, WEIGHTS, BalanceSettings
-from cg_control.live_design import LiveDesign
+from cg_control.balancing.balance import BALANCING, WEIGHTS, BalanceSettings
+from cg_control.balancing.live_design import LiveDesign
 from cg_control.state_message import state_of
 from cg_description.paths import model_path
 from cg_dynamics.model import Model

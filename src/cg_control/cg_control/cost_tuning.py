@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.collocation import Options
-from cg_control.planning import executed, plan
-from cg_control.task import Task
-from cg_control.tracking import TrackingSettings
-from cg_control.trajectory import Trajectory
-from cg_control.tvlqr import Weights, stabilise
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.following.planning import executed, plan
+from cg_control.following.tracking import TrackingSettings
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import Trajectory
+from cg_control.trajectories.tvlqr import Weights, stabilise
 from cg_description.model_file import write_atomically
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.model import Model

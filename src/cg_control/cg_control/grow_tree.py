@@ -22,18 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.basin import sample_basin, shipped_basins
-from cg_control.checkpoint import Checkpoint, Keeper
-from cg_control.cluster import Cluster
-from cg_control.extension import Extension, ExtensionOptions, upright_form
-from cg_control.growth import Counts, Grower, GrowthOptions, Region
-from cg_control.nodes import Nodes, Way
-from cg_control.preview import CHAMPIONS, LANDING, WALKERS, Preview, champions, pruned
-from cg_control.tracking import WALKING
-from cg_control.tree import Tree, TreeError
-from cg_control.tvlqr import Weights, balance_regulator
-from cg_control.walking_region import OrbitPoints, WalkingRegion
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.balancing.basin import sample_basin, shipped_basins
+from cg_control.following.nodes import Nodes, Way
+from cg_control.following.tracking import WALKING
+from cg_control.trajectories.tvlqr import Weights, balance_regulator
+from cg_control.trees.checkpoint import Checkpoint, Keeper
+from cg_control.trees.cluster import Cluster
+from cg_control.trees.extension import Extension, ExtensionOptions, upright_form
+from cg_control.trees.growth import Counts, Grower, GrowthOptions, Region
+from cg_control.trees.preview import CHAMPIONS, LANDING, WALKERS, Preview, champions, pruned
+from cg_control.trees.tree import Tree, TreeError
+from cg_control.walking.walking_region import OrbitPoints, WalkingRegion
 from cg_description.paths import model_path
 from cg_dynamics.cluster import ClusterError
 from cg_dynamics.model import Model

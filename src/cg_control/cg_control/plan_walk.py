@@ -12,13 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cg_control.collocation import PlanningError
+from cg_control.following.nodes import Nodes
 from cg_control.grow_tree import upright_tree
-from cg_control.nodes import Nodes
-from cg_control.orbit import Orbit, plan_orbit
-from cg_control.preview import pruned
-from cg_control.tree import Tree, TreeError
-from cg_control.walking import orbit_nodes, with_orbits, with_ways
+from cg_control.orbits.orbit import Orbit, plan_orbit
+from cg_control.trajectories.collocation import PlanningError
+from cg_control.trees.preview import pruned
+from cg_control.trees.tree import Tree, TreeError
+from cg_control.walking.walking_tree import orbit_nodes, with_orbits, with_ways
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

@@ -18,10 +18,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from cg_control.collocation import Options
-from cg_control.planning import plan
-from cg_control.task import Task
-from cg_control.trajectory import Trajectory
+from cg_control.following.planning import plan
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES

@@ -26,12 +26,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Int32, String
 
 from cg_control.answer_age import AnswerAges, percentiles
-from cg_control.balance import BALANCING, WEIGHTS
-from cg_control.live_design import LiveDesign
-from cg_control.recovery import FOLLOWING, KEPT, RecoverySettings, TreeController
+from cg_control.balancing.balance import BALANCING, WEIGHTS
+from cg_control.balancing.live_design import LiveDesign
 from cg_control.state_message import state_of
-from cg_control.tree_files import TreeSelection
-from cg_control.tree_loader import TreeLoader
+from cg_control.trees.recovery import FOLLOWING, KEPT, RecoverySettings, TreeController
+from cg_control.trees.tree_files import TreeSelection
+from cg_control.trees.tree_loader import TreeLoader
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_interfaces import topics

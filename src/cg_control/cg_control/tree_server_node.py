@@ -29,10 +29,10 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from cg_control.tree import Tree
-from cg_control.tree_files import TreeSelection, tree_path
-from cg_control.tube_view import surface_segments, tube_segments
-from cg_control.way_home import WayHome
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import TreeSelection, tree_path
+from cg_control.trees.tube_view import surface_segments, tube_segments
+from cg_control.trees.way_home import WayHome
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES

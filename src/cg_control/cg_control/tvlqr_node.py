@@ -22,11 +22,16 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from cg_control.balance import BALANCING, WEIGHTS
-from cg_control.execution import CAUGHT, TRACKING, ExecutionSettings, TrajectoryController
-from cg_control.live_design import LiveDesign
+from cg_control.balancing.balance import BALANCING, WEIGHTS
+from cg_control.balancing.live_design import LiveDesign
+from cg_control.following.execution import (
+    CAUGHT,
+    TRACKING,
+    ExecutionSettings,
+    TrajectoryController,
+)
 from cg_control.state_message import state_of
-from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_control.trajectories.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_interfaces import topics

@@ -2,10 +2,10 @@
 
 import pytest
 
-from cg_control.collocation import Options
-from cg_control.planning import plan
-from cg_control.task import Task
-from cg_control.trajectory import Trajectory
+from cg_control.following.planning import plan
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import Trajectory
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from cg_control.surfaces import between
-from cg_control.trajectory import Phase
+from cg_control.orbits.surfaces import between
+from cg_control.trajectories.trajectory import Phase
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model

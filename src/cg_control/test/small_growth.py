@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cg_control import grow_tree
-from cg_control.nodes import ARRAYS
-from cg_control.tree import Tree
+from cg_control.following.nodes import ARRAYS
+from cg_control.trees.tree import Tree
 
 BOX = (0.25, 0.5, 0.8, 2.0)  # rad and rad/s, in the roles of the legs
 ROUND = 64

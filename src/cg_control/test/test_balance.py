@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cg_control.balance import (
+from cg_control.balancing.balance import (
     BALANCING,
     FALLEN,
     IDLE,
@@ -15,10 +15,10 @@ from cg_control.balance import (
     balance_gains,
     slow_modes,
 )
-from cg_control.basin import SWINGS, Basin, modes_of, sample_basin, shipped_basins
+from cg_control.balancing.basin import SWINGS, Basin, modes_of, sample_basin, shipped_basins
+from cg_control.balancing.linearise import design_model, linearise_stance
+from cg_control.balancing.lqr import LqrError
 from cg_control.friction import FrictionCompensation, FrictionSettings
-from cg_control.linearise import design_model, linearise_stance
-from cg_control.lqr import LqrError
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model
@@ -222,7 +222,7 @@ def test_drawn_states_are_inside_and_fill_it():
 def test_weak_motor_has_a_small_basin(monkeypatch):
     # Few samples: what is tested is the sampling, not the number.
     for name, value in (('SWINGS', (0.0,)), ('SAMPLES', 4), ('HALVINGS', 4), ('DURATION', 3.0)):
-        monkeypatch.setattr(f'cg_control.basin.{name}', value)
+        monkeypatch.setattr(f'cg_control.balancing.basin.{name}', value)
     strong, weak = (
         sample_basin(MODEL, 'inner', GAINS['inner'], limit).bounds[0] for limit in (40.0, 10.0)
     )

@@ -12,12 +12,12 @@ import pytest
 from small_growth import BOX, ROUND, assert_same, make_small, started
 
 from cg_control import grow_tree
-from cg_control.checkpoint import LEVELS, Checkpoint, Keeper, told
-from cg_control.extension import Extension, ExtensionOptions
-from cg_control.growth import Grower, GrowthOptions, Region
-from cg_control.tracking import TrackingSettings
-from cg_control.tree import Tree, TreeError
-from cg_control.tvlqr import Weights
+from cg_control.following.tracking import TrackingSettings
+from cg_control.trajectories.tvlqr import Weights
+from cg_control.trees.checkpoint import LEVELS, Checkpoint, Keeper, told
+from cg_control.trees.extension import Extension, ExtensionOptions
+from cg_control.trees.growth import Grower, GrowthOptions, Region
+from cg_control.trees.tree import Tree, TreeError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiler import compiler

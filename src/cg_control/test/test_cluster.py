@@ -8,7 +8,7 @@ import pytest
 from small_growth import ROUND, assert_same, make_small
 
 from cg_control import grow_tree
-from cg_control.cluster import Cluster
+from cg_control.trees.cluster import Cluster
 from cg_dynamics import cluster
 from cg_dynamics.cluster import ClusterError
 from cg_dynamics.rollout.compiler import compiler
@@ -64,7 +64,7 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 def test_another_software_is_refused(tmp_path, monkeypatch):
-    from cg_control import cluster as ours
+    from cg_control.trees import cluster as ours
 
     other = {**ours.software_here(), 'python': '3.4.1'}
     monkeypatch.setattr(ours, 'software_here', lambda: other)

@@ -6,7 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from cg_control.collocation import (
+from cg_control.following.nodes import Nodes
+from cg_control.friction import FrictionCompensation
+from cg_control.trajectories.collocation import (
     InfeasibleError,
     Options,
     PlanningError,
@@ -16,10 +18,8 @@ from cg_control.collocation import (
     screen,
     softened,
 )
-from cg_control.friction import FrictionCompensation
-from cg_control.nodes import Nodes
-from cg_control.task import Box, Ellipsoid, Stretch, Task
-from cg_control.tvlqr import stabilise
+from cg_control.trajectories.task import Box, Ellipsoid, Task
+from cg_control.trajectories.tvlqr import stabilise
 from cg_dynamics.walking.gait import find_gait
 from cg_dynamics.walking.hybrid import WalkOptions, walk
 from cg_dynamics.walking.impact import impact
@@ -236,7 +236,7 @@ def branch(robot):
 
 
 def test_a_stretch_is_the_branch_it_is_cut_from(branch):
-    stretch = Stretch.along(branch, branch.first)
+    stretch = branch.stretch(branch.first)
     assert stretch.stance == 'inner'
     # As far as the impact, and no further.
     assert branch.impact[branch.next[stretch.node[-1]]]
@@ -244,18 +244,18 @@ def test_a_stretch_is_the_branch_it_is_cut_from(branch):
         node, since = stretch.place(s)
         expected = since ** np.arange(4.0) @ branch.edges[node][:, 1:5]
         np.testing.assert_array_equal(stretch.at(s), expected)
-    part = Stretch.along(branch, branch.first + 2, pieces=3)
+    part = branch.stretch(branch.first + 2, pieces=3)
     assert part.node.tolist() == [branch.first + k for k in (2, 3, 4)]
     np.testing.assert_allclose(part.at(0.0), branch.x0[branch.first + 2])
     with pytest.raises(ValueError, match='no stretch begins at node 0'):
-        Stretch.along(branch, 0)
+        branch.stretch(0)
     with pytest.raises(ValueError, match='stretch on the inner leg'):
         Task(('outer',), goal=stretch)
 
 
 def test_a_motion_ends_where_joining_the_branch_is_cheapest(robot, branch):
     """No node is as cheap to end in, and the way on is counted with the weights of the task."""
-    stretch = Stretch.along(branch, branch.first, pieces=12)
+    stretch = branch.stretch(branch.first, pieces=12)
     start = Box.point([0.01, -0.05, 0.05, 0.3])
     found = optimise(robot, Task(('inner',), start, stretch), friction=False)
     onto, since = found.provenance['onto'], found.provenance['elapsed']
@@ -287,7 +287,7 @@ def test_a_motion_may_end_near_a_branch(robot, branch):
     start = Box.point([0.01, -0.05, 0.05, 0.3])
     exact, near = (
         optimise(
-            robot, Task(('inner',), start, Stretch.along(branch, branch.first, 12, tolerance)),
+            robot, Task(('inner',), start, branch.stretch(branch.first, 12, tolerance)),
             friction=False,
         )
         for tolerance in (None, form)
@@ -303,7 +303,7 @@ def test_several_steps_end_on_a_branch_of_either_leg(robot, branch, steps):
     """Walking on, from where a planned rebalance stands, until a foot meets the branch."""
     legs = tuple(('outer', 'inner')[k % 2] for k in range(steps + 1))
     at = branch.first if legs[-1] == 'inner' else int(branch.landing[branch.first])
-    goal = Stretch.along(branch, at)
+    goal = branch.stretch(at)
     found = optimise(
         robot, Task(legs, Box.point(np.zeros(4)), goal), Options(fine=8, coarse=8),
         friction=False,

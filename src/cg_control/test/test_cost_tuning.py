@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from cg_control.collocation import Options
 from cg_control.cost_tuning import Trial, draw, score, search, starts
-from cg_control.planning import plan
-from cg_control.task import Task
-from cg_control.tvlqr import Weights
+from cg_control.following.planning import plan
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.tvlqr import Weights
 
 
 @pytest.fixture(scope='module')

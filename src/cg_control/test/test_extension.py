@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from small_growth import BOX, ROUND
 
-from cg_control.extension import Extension
 from cg_control.grow_tree import LANDING, upright_tree
-from cg_control.growth import Branch, GivenUp, Grower, GrowthOptions, Region
+from cg_control.trees.extension import Extension
+from cg_control.trees.growth import Branch, GivenUp, Grower, GrowthOptions, Region
 from cg_dynamics.rollout.compiler import compiler
 from cg_dynamics.watched_processes import WatchedProcesses
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from small_growth import ROUND, assert_same, make_small
 
-from cg_control.checkpoint import Checkpoint
-from cg_control.extension import Extension, ExtensionOptions
+from cg_control.following.tracking import TrackingSettings
 from cg_control.grow_tree import BOX, GROWTH, LANDING, REGION, Growing, grow, main, upright_tree
-from cg_control.growth import Counts, Grower, Region
-from cg_control.lookup import Lookup
-from cg_control.rollouts import Outcome, follow
-from cg_control.tracking import TrackingSettings
-from cg_control.tree import Tree
+from cg_control.trees.checkpoint import Checkpoint
+from cg_control.trees.extension import Extension, ExtensionOptions
+from cg_control.trees.growth import Counts, Grower, Region
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.rollouts import Outcome, follow
+from cg_control.trees.tree import Tree
 from cg_dynamics.rollout.compiler import compiler
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')

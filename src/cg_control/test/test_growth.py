@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.basin import shipped_basins
-from cg_control.extension import Extension, upright_form
-from cg_control.growth import Branch, Grower, GrowthOptions, Region, in_coordinates
-from cg_control.lookup import Lookup
-from cg_control.nodes import ARRAYS, Nodes
-from cg_control.rollouts import Outcome
-from cg_control.tree import Tree
-from cg_control.tvlqr import Weights, balance_regulator
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.following.nodes import ARRAYS, Nodes
+from cg_control.trajectories.tvlqr import Weights, balance_regulator
+from cg_control.trees.extension import Extension, upright_form
+from cg_control.trees.growth import Branch, Grower, GrowthOptions, Region, in_coordinates
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.rollouts import Outcome
+from cg_control.trees.tree import Tree
 from cg_dynamics.rig import STANCES
 from cg_dynamics.rollout.compiler import compiler
 from cg_dynamics.walking.hybrid import WalkOptions

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from cg_control.basin import modes_of
-from cg_control.collocation import planning_model, softened
+from cg_control.balancing.basin import modes_of
+from cg_control.balancing.linearise import design_model
 from cg_control.friction import FrictionCompensation, compensated
-from cg_control.linearise import design_model
+from cg_control.trajectories.collocation import planning_model, softened
 from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY, UNMODELLED
 from cg_dynamics.linearise import without_dry_friction, without_extra_states

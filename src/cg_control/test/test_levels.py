@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cg_control.levels import EDGES, PER_DECADE, Levels
+from cg_control.trees.levels import EDGES, PER_DECADE, Levels
 
 STEP = 10.0 ** (1 / PER_DECADE)  # from one edge to the next
 

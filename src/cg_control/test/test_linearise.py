@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_control.linearise import design_model, discretise, linearise_stance
-from cg_control.lqr import lqr
+from cg_control.balancing.linearise import design_model, discretise, linearise_stance
+from cg_control.balancing.lqr import lqr
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

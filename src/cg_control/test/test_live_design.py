@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cg_control.balance import BalanceSettings, balance_gains
-from cg_control.basin import sample_basin
-from cg_control.basin_sampler import BasinError, BasinSampler
-from cg_control.live_design import LiveDesign
-from cg_control.lqr import LqrError
+from cg_control.balancing.balance import BalanceSettings, balance_gains
+from cg_control.balancing.basin import sample_basin
+from cg_control.balancing.basin_sampler import BasinError, BasinSampler
+from cg_control.balancing.live_design import LiveDesign
+from cg_control.balancing.lqr import LqrError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

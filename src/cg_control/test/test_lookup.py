@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_control.lookup import Lookup, lifted, monomials
-from cg_control.nodes import Nodes
+from cg_control.following.nodes import Nodes
+from cg_control.trees.lookup import Lookup, lifted, monomials
 
 
 @pytest.fixture(scope='module')

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from cg_control.lqr import LqrError, dlqr, lqr
+from cg_control.balancing.lqr import LqrError, dlqr, lqr
 
 DOUBLE_INTEGRATOR = (np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]))
 

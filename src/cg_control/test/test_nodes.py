@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control.nodes import ARRAYS, LATE, Nodes
-from cg_control.trajectory import Trajectory, TrajectoryError
+from cg_control.following.nodes import ARRAYS, LATE, Nodes
+from cg_control.trajectories.trajectory import Trajectory, TrajectoryError
 from cg_dynamics.rig import STANCES
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cg_control.closing import closed, half_angle
-from cg_control.collocation import PlanningError, planning_model
-from cg_control.floquet import monodromy, multipliers, section_map
-from cg_control.orbit import Orbit, Sampled, plan_orbit
-from cg_control.orbit_library import orbit_library
-from cg_control.trajectory import Phase, Trajectory
-from cg_control.tvlqr import stabilise
+from cg_control.orbits.closing import closed, half_angle
+from cg_control.orbits.floquet import monodromy, multipliers, section_map
+from cg_control.orbits.orbit import Orbit, Sampled, plan_orbit
+from cg_control.orbits.orbit_library import orbit_library
+from cg_control.trajectories.collocation import PlanningError, planning_model
+from cg_control.trajectories.trajectory import Phase, Trajectory
+from cg_control.trajectories.tvlqr import stabilise
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model
@@ -269,7 +269,7 @@ def test_a_second_search_keeps_the_foot_above_the_ground(walker, monkeypatch):
         depths.append(task.retraction)
         raise PlanningError(f'nothing within {task.retraction} m', 7)
 
-    monkeypatch.setattr('cg_control.orbit._orbit', found_nothing)
+    monkeypatch.setattr('cg_control.orbits.orbit._orbit', found_nothing)
     with pytest.raises(PlanningError, match='nothing within inf') as caught:
         plan_orbit(walker, 0.3, 0.3)
     assert depths == [np.inf, 0.02]

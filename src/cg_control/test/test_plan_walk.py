@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from cg_control import plan_walk
-from cg_control.routes import UPRIGHT, Routes
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.trees.routes import UPRIGHT, Routes
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 
 
 @pytest.mark.slow

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from cg_control.extension import Extension
 from cg_control.grow_tree import upright_tree
-from cg_control.growth import Grower, GrowthOptions, Region
-from cg_control.lookup import Lookup
-from cg_control.preview import LANDING, Preview
-from cg_control.rollouts import Outcome, follow
+from cg_control.trees.extension import Extension
+from cg_control.trees.growth import Grower, GrowthOptions, Region
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.preview import LANDING, Preview
+from cg_control.trees.rollouts import Outcome, follow
 from cg_dynamics.rollout.compiler import compiler
 from cg_dynamics.walking.hybrid import WalkOptions
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from cg_control.collocation import Options, PlanningError, optimise, planning_model
-from cg_control.linearise import linearise_stance
-from cg_control.reach import HELD, Screen, cheap
-from cg_control.task import Box, Task
+from cg_control.balancing.linearise import linearise_stance
+from cg_control.trajectories.collocation import Options, PlanningError, optimise, planning_model
+from cg_control.trajectories.reach import HELD, Screen, cheap
+from cg_control.trajectories.task import Box, Task
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.impact import other
 

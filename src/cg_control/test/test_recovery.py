@@ -7,16 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from cg_control.balance import BalanceController, balance_gains
-from cg_control.basin import shipped_basins
+from cg_control.balancing.balance import BalanceController, balance_gains
+from cg_control.balancing.basin import shipped_basins
+from cg_control.following.tracking import Tracker
 from cg_control.grow_tree import BOX, LANDING
-from cg_control.growth import Grower, Region
-from cg_control.lookup import Claim, Lookup
-from cg_control.preview import Preview
-from cg_control.recovery import FOLLOWING, OUTSIDE, ReadyTree, RecoverySettings, TreeController
-from cg_control.tracking import Tracker
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
+from cg_control.trees.growth import Grower, Region
+from cg_control.trees.lookup import Claim, Lookup
+from cg_control.trees.preview import Preview
+from cg_control.trees.recovery import (
+    FOLLOWING,
+    OUTSIDE,
+    ReadyTree,
+    RecoverySettings,
+    TreeController,
+)
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
 from cg_dynamics.errors import SimulationError
 from cg_dynamics.rig import STANCES
 from cg_dynamics.rollout.compiler import compiler

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control import rollouts as module
-from cg_control.nodes import Nodes
-from cg_control.rollouts import Outcome, follow
-from cg_control.tracking import Tracker, TrackingSettings
+from cg_control.following.nodes import Nodes
+from cg_control.following.tracking import Tracker, TrackingSettings
+from cg_control.trees import rollouts as module
+from cg_control.trees.rollouts import Outcome, follow
 from cg_description.paths import model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.model import Model

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control.collocation import Options, optimise
-from cg_control.orbit import plan_orbit
-from cg_control.surfaces import (
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.orbits.surfaces import (
     IMPACT,
     TORQUE,
     UNITS,
@@ -17,8 +16,9 @@ from cg_control.surfaces import (
     with_planes,
     with_surfaces,
 )
-from cg_control.task import Box, Task
-from cg_control.trajectory import Phase, TrajectoryError
+from cg_control.trajectories.collocation import Options, optimise
+from cg_control.trajectories.task import Box, Task
+from cg_control.trajectories.trajectory import Phase, TrajectoryError
 from cg_dynamics.walking.hybrid import swing_foot
 
 SLOPE = np.radians(-1.0)
@@ -118,7 +118,7 @@ def test_phase_advances_up_to_its_radius(surfaces, robot):
     """To first order by construction; the exact model keeps it to half of that."""
     from exact_motion import rates
 
-    from cg_control.surfaces import design_of
+    from cg_control.orbits.surfaces import design_of
 
     design, rng = design_of(surfaces, robot), np.random.default_rng(2)
     for phase, radii in zip(surfaces.phases, tube(surfaces, robot), strict=True):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cg_control.growth import Grower, GrowthOptions, Region
-from cg_control.lookup import Lookup
-from cg_control.nodes import ARRAYS
-from cg_control.preview import AT_HOME
-from cg_control.rollouts import Outcome, follow
-from cg_control.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
+from cg_control.following.nodes import ARRAYS
+from cg_control.trees.growth import Grower, GrowthOptions, Region
+from cg_control.trees.lookup import Lookup
+from cg_control.trees.preview import AT_HOME
+from cg_control.trees.rollouts import Outcome, follow
+from cg_control.trees.swing_up import SwingOptions, SwingUp, upright_root, whole_turns
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rollout.compiler import compiler

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control.balance import BalanceController, balance_gains
-from cg_control.collocation import Options
-from cg_control.execution import ExecutionSettings, TrajectoryController
-from cg_control.nodes import Nodes
-from cg_control.planning import CheckOptions, RejectedError, check, executed, plan
-from cg_control.task import Task
-from cg_control.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
-from cg_control.trajectory import TrajectoryError
+from cg_control.balancing.balance import BalanceController, balance_gains
+from cg_control.following.execution import ExecutionSettings, TrajectoryController
+from cg_control.following.nodes import Nodes
+from cg_control.following.planning import CheckOptions, RejectedError, check, executed, plan
+from cg_control.following.tracking import REMEDIES, Tracker, TrackingSettings, wrong_leg
+from cg_control.trajectories.collocation import Options
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import TrajectoryError
 from cg_dynamics.walking.hybrid import WalkOptions
 
 OPTIONS = WalkOptions(sample_time=0.004, step=0.002, minimum_step=0.1, fall_angle=0.6)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from cg_control.trajectory import Phase, Trajectory, TrajectoryError
+from cg_control.trajectories.trajectory import Phase, Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
 from cg_control.playback_node import PlaybackNode, Recital  # noqa: E402
-from cg_control.trajectory import Trajectory  # noqa: E402
+from cg_control.trajectories.trajectory import Trajectory  # noqa: E402
 from cg_control.trajectory_server_node import (  # noqa: E402
     TrajectoryServerNode,
     joint_trajectory,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_control.collocation import planning_model
-from cg_control.transcription import EDGE, PIECES, UNITS, Structure, transcribe
+from cg_control.trajectories.collocation import planning_model
+from cg_control.trajectories.transcription import EDGE, PIECES, UNITS, Structure, transcribe
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import compile_model

@@ -10,17 +10,12 @@ import pytest
 from exact_motion import TIGHT, densified, over_phase, rates
 from scipy.integrate import solve_ivp
 
-from cg_control import transverse
-from cg_control.collocation import Options, optimise, planning_model
-from cg_control.nodes import Nodes
-from cg_control.orbit import plan_orbit
-from cg_control.preview import LANDING
-from cg_control.rollouts import follow
-from cg_control.surfaces import UNITS, between, design_of, phase_of, with_surfaces
-from cg_control.task import Box, Task
-from cg_control.tracking import WALKING
-from cg_control.trajectory import TrajectoryError
-from cg_control.transverse import (
+from cg_control.following.nodes import Nodes
+from cg_control.following.tracking import WALKING
+from cg_control.orbits import transverse
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.orbits.surfaces import UNITS, between, design_of, phase_of, with_surfaces
+from cg_control.orbits.transverse import (
     OVER_PHASE,
     TRANSVERSE,
     UnstableError,
@@ -32,7 +27,10 @@ from cg_control.transverse import (
     transverse_linearisation,
     with_own_surfaces,
 )
-from cg_control.tvlqr import (
+from cg_control.trajectories.collocation import Options, optimise, planning_model
+from cg_control.trajectories.task import Box, Task
+from cg_control.trajectories.trajectory import TrajectoryError
+from cg_control.trajectories.tvlqr import (
     GAUSS,
     Weights,
     exponentials,
@@ -41,6 +39,8 @@ from cg_control.tvlqr import (
     stabilise,
     stabilise_periodically,
 )
+from cg_control.trees.preview import LANDING
+from cg_control.trees.rollouts import follow
 from cg_dynamics.walking.hybrid import WalkOptions, walk
 from cg_dynamics.walking.impact import impact
 

@@ -6,9 +6,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from cg_control import tree as module
-from cg_control.nodes import ARRAYS, Nodes
-from cg_control.tree import Tree, TreeError
+from cg_control.following.nodes import ARRAYS, Nodes
+from cg_control.trees import tree as module
+from cg_control.trees.tree import Tree, TreeError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

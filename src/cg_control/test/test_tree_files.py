@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from cg_control import tree_loader
-from cg_control.recovery import ReadyTree
-from cg_control.tree import Tree, TreeError
-from cg_control.tree_files import TreeSelection, tree_names, tree_path
-from cg_control.tree_loader import TreeLoader
+from cg_control.trees import tree_loader
+from cg_control.trees.recovery import ReadyTree
+from cg_control.trees.tree import Tree, TreeError
+from cg_control.trees.tree_files import TreeSelection, tree_names, tree_path
+from cg_control.trees.tree_loader import TreeLoader
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 

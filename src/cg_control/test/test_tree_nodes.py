@@ -20,13 +20,13 @@ from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
-from cg_control.lookup import Lookup  # noqa: E402
-from cg_control.tracking import WALKING, TrackingSettings  # noqa: E402
-from cg_control.tree import Tree  # noqa: E402
+from cg_control.following.tracking import WALKING, TrackingSettings  # noqa: E402
 from cg_control.tree_controller_node import TreeControllerNode  # noqa: E402
-from cg_control.tree_files import TreeSelection, tree_path  # noqa: E402
 from cg_control.tree_server_node import TreeServerNode  # noqa: E402
-from cg_control.way_home import WayHome  # noqa: E402
+from cg_control.trees.lookup import Lookup  # noqa: E402
+from cg_control.trees.tree import Tree  # noqa: E402
+from cg_control.trees.tree_files import TreeSelection, tree_path  # noqa: E402
+from cg_control.trees.way_home import WayHome  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, to_stamp  # noqa: E402
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control import tube_view
-from cg_control.routes import UPRIGHT, Routes
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
-from cg_control.tube_view import CORNERS, MOST_KNOTS, POSES, surface_segments, tube_segments
-from cg_control.way_home import WayHome
+from cg_control.trees import tube_view
+from cg_control.trees.routes import UPRIGHT, Routes
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
+from cg_control.trees.tube_view import CORNERS, MOST_KNOTS, POSES, surface_segments, tube_segments
+from cg_control.trees.way_home import WayHome
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.hybrid import swing_foot
 

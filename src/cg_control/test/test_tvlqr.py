@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from cg_control.collocation import Options, optimise, planning_model
-from cg_control.floquet import multipliers
-from cg_control.linearise import design_model, linearise_stance
-from cg_control.lqr import lqr
-from cg_control.orbit import plan_orbit
-from cg_control.task import Task
-from cg_control.trajectory import Phase, TrajectoryError
-from cg_control.tvlqr import (
+from cg_control.balancing.linearise import design_model, linearise_stance
+from cg_control.balancing.lqr import lqr
+from cg_control.orbits.floquet import multipliers
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.trajectories.collocation import Options, optimise, planning_model
+from cg_control.trajectories.task import Task
+from cg_control.trajectories.trajectory import Phase, TrajectoryError
+from cg_control.trajectories.tvlqr import (
     Weights,
     balance_regulator,
     exponentials,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cg_control.collocation import planning_model
-from cg_control.flow import state_rates
-from cg_control.orbit import plan_orbit
-from cg_control.trajectory import TrajectoryError
-from cg_control.virtual_constraints import BANDWIDTH, VirtualConstraints
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.orbits.virtual_constraints import BANDWIDTH, VirtualConstraints
+from cg_control.trajectories.collocation import planning_model
+from cg_control.trajectories.flow import state_rates
+from cg_control.trajectories.trajectory import TrajectoryError
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.hybrid import WalkOptions, walk
 from cg_dynamics.walking.impact import impact

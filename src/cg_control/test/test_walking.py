@@ -5,18 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cg_control import rollouts
+from cg_control.following.nodes import Nodes, Way
+from cg_control.following.tracking import WALKING, Tracker
 from cg_control.grow_tree import upright_tree
-from cg_control.nodes import Nodes, Way
-from cg_control.orbit import plan_orbit
-from cg_control.preview import LANDING
-from cg_control.rollouts import Outcome, follow
-from cg_control.routes import UPRIGHT, Departure, Routes
-from cg_control.tracking import WALKING, Tracker
-from cg_control.trajectory import TrajectoryError
-from cg_control.tree import Tree, TreeError
-from cg_control.tree_files import tree_path
-from cg_control.walking import (
+from cg_control.orbits.orbit import plan_orbit
+from cg_control.trajectories.trajectory import TrajectoryError
+from cg_control.trees import rollouts
+from cg_control.trees.preview import LANDING
+from cg_control.trees.rollouts import Outcome, follow
+from cg_control.trees.routes import UPRIGHT, Departure, Routes
+from cg_control.trees.tree import Tree, TreeError
+from cg_control.trees.tree_files import tree_path
+from cg_control.trees.way_home import WayHome
+from cg_control.walking.walking_tree import (
     TubeOptions,
     across,
     buried,
@@ -25,7 +26,6 @@ from cg_control.walking import (
     with_orbits,
     with_ways,
 )
-from cg_control.way_home import WayHome
 from cg_dynamics.rig import STANCES
 from cg_dynamics.walking.hybrid import swing_foot, walk
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from cg_control import grow_tree
-from cg_control.extension import Extension, ExtensionOptions, nearest_orbits
-from cg_control.growth import Branch
-from cg_control.nodes import Way
-from cg_control.preview import Preview, pruned
-from cg_control.routes import Routes
-from cg_control.tracking import WALKING
-from cg_control.tree import Tree
-from cg_control.tree_files import tree_path
-from cg_control.walking import buried
-from cg_control.walking_region import OrbitPoints, WalkingRegion
+from cg_control.following.nodes import Way
+from cg_control.following.tracking import WALKING
+from cg_control.trees.extension import Extension, ExtensionOptions, nearest_orbits
+from cg_control.trees.growth import Branch
+from cg_control.trees.preview import Preview, pruned
+from cg_control.trees.routes import Routes
+from cg_control.trees.tree import Tree
+from cg_control.trees.tree_files import tree_path
+from cg_control.walking.walking_region import OrbitPoints, WalkingRegion
+from cg_control.walking.walking_tree import buried
 from cg_dynamics.rollout.compiler import compiler
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason='thousands of rollouts')

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cg_control.nodes import Nodes
-from cg_control.way_home import WayHome
+from cg_control.following.nodes import Nodes
+from cg_control.trees.way_home import WayHome
 
 
 @pytest.fixture(scope='module')

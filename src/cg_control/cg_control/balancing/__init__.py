@@ -1,0 +1,1 @@
+"""Standing on one leg: the design model, regulators, and from where they catch the robot."""

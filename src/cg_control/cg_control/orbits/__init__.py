@@ -1,0 +1,1 @@
+"""Periodic motions: planned, closed, stabilised across them."""

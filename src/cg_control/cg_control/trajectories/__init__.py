@@ -1,0 +1,1 @@
+"""One motion: what is asked of it, direct collocation, and feedback along it."""

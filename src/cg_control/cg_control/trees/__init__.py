@@ -1,0 +1,1 @@
+"""LQR-trees: growth by falsification, what they hold, and coming home along them."""
