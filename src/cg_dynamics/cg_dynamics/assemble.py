@@ -5,8 +5,9 @@ vector p is the mechanism's parameters, then those of each effect, then those of
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -121,45 +122,118 @@ def parameter_vector(model: Model, setup: Setup) -> np.ndarray:
 
 def assemble(model: Model, setup: Setup) -> Equations:
     """Build the equations of a model in a set-up; only acting effects take part."""
-    mechanism = model.mechanism
-    names = parameter_names(model, setup)
-    p = ca.SX.sym('p', len(names))
-    by_name = dict(zip(names, ca.vertsplit(p), strict=True))
-    effects = acting_effects(model)
-    own = {
-        effect.label: {q.name: by_name[f'{effect.label}.{q.name}'] for q in effect.parameters}
-        for effect in effects
-    }
-    asked = dict.fromkeys(name for e in effects for name in e.extra_inputs)
-    extra_inputs = tuple(name for name in asked if name not in mechanism.inputs)
-    u = ca.SX.sym('u', len(mechanism.inputs) + len(extra_inputs))
-    torque_inputs = ca.vertsplit(u)[: len(mechanism.inputs)]
-    measured = dict(zip((*mechanism.inputs, *extra_inputs), ca.vertsplit(u), strict=True))
-    for e in effects:
-        own[e.label] |= {name: measured[name] for name in e.extra_inputs}
-    kinematics = mechanism.kinematics(setup)
-    m = len(kinematics.names)
-    extra = [f'{effect.label}.{state}' for effect in effects for state in effect.states]
-    x = ca.SX.sym('x', 2 * m + len(extra))
-    s, ds = x[:m], x[m : 2 * m]
-    z = dict(zip(extra, ca.vertsplit(x[2 * m :]), strict=True)) if extra else {}
-    z_of = {e.label: [z[f'{e.label}.{state}'] for state in e.states] for e in effects}
-    dz: dict[str, list[ca.SX]] = {}
+    made = _Assembly(model, setup)
+    dynamics = made.dynamics(made.torques())
+    acceleration = solve_small(dynamics.mass_matrix, dynamics.load)
+    outputs = made.readings()
+    input_delay, output_delays = made.delays(outputs)
+    names, effects = made.kinematics.names, made.effects
+    return Equations(
+        x=made.x,
+        u=made.u,
+        p=made.p,
+        rates=ca.vertcat(made.ds, acceleration, *made.state_rates()),
+        outputs=ca.vertcat(*outputs.values()),
+        initial=ca.vertcat(made.s, made.ds, *made.starts()),
+        input_delay=input_delay,
+        output_delays=ca.vertcat(*output_delays),
+        mass_matrix=dynamics.mass_matrix,
+        load=dynamics.load,
+        acceleration=dynamics.acceleration,
+        imbalance=dynamics.imbalance,
+        energy=dynamics.energy,
+        state_names=(*names, *(f'd{name}/dt' for name in names), *made.extra_states),
+        parameter_names=made.parameter_names,
+        input_names=made.input_names,
+        channels=tuple(outputs),
+        coordinates=len(names),
+        state_scales=(
+            *(1.0 for _ in range(2 * len(names))),
+            *(scale for e in effects for scale in e.state_scales or (1.0,) * len(e.states)),
+        ),
+        largest_step=min((e.largest_step for e in effects), default=float('inf')),
+    )
 
-    def pass_through(effect, result):
+
+@dataclass(frozen=True)
+class _Dynamics:
+    """Of the bodies, in free coordinates; as the attributes of `Equations`."""
+
+    mass_matrix: ca.SX
+    load: ca.SX
+    acceleration: ca.SX
+    imbalance: ca.SX
+    energy: ca.SX
+
+
+class _Assembly:
+    """Equations in the making: their symbols, and what effects have said of their states so far.
+
+    Effects are asked in the order of the path: torques, bodies, readings; then `state_rates` and
+    `starts` are complete.
+
+    Attributes:
+        own: Label of an effect -> name of a parameter or of an extra input -> its symbol.
+        states: Label of an effect -> symbols of its states.
+        rates: Label -> rates of these.
+        settled: Label -> these at rest, in the order of the path.
+    """
+
+    def __init__(self, model: Model, setup: Setup):
+        self.mechanism, self.setup = model.mechanism, setup
+        self.effects = acting_effects(model)
+        self.parameter_names = parameter_names(model, setup)
+        self.p = ca.SX.sym('p', len(self.parameter_names))
+        self.by_name = dict(zip(self.parameter_names, ca.vertsplit(self.p), strict=True))
+        asked = dict.fromkeys(name for e in self.effects for name in e.extra_inputs)
+        inputs = self.mechanism.inputs
+        self.input_names = (*inputs, *(name for name in asked if name not in inputs))
+        self.u = ca.SX.sym('u', len(self.input_names))
+        self.input = dict(zip(self.input_names, ca.vertsplit(self.u), strict=True))
+        self.own = {
+            e.label: {q.name: self.by_name[f'{e.label}.{q.name}'] for q in e.parameters}
+            | {name: self.input[name] for name in e.extra_inputs}
+            for e in self.effects
+        }
+        self.kinematics = self.mechanism.kinematics(setup)
+        m = len(self.kinematics.names)
+        self.extra_states = [f'{e.label}.{state}' for e in self.effects for state in e.states]
+        self.x = ca.SX.sym('x', 2 * m + len(self.extra_states))
+        self.s, self.ds = self.x[:m], self.x[m : 2 * m]
+        extra = ca.vertsplit(self.x[2 * m :]) if self.extra_states else []
+        z = dict(zip(self.extra_states, extra, strict=True))
+        self.states = {e.label: [z[f'{e.label}.{state}'] for state in e.states]
+                       for e in self.effects}  # fmt: skip
+        self.rates: dict[str, list[ca.SX]] = {}
+        self.settled: dict[str, list[ca.SX]] = {}
+        # All coordinates and their rates: symbols, and what they are in free ones.
+        coordinates = self.kinematics.basis.shape[0]
+        self.q, self.v = ca.SX.sym('q', coordinates), ca.SX.sym('v', coordinates)
+        self.full = [
+            ca.mtimes(self.kinematics.basis, self.s) + self.kinematics.offset,
+            ca.mtimes(self.kinematics.basis, self.ds),
+        ]
+
+    def _passed(self, effect: Effect, result: tuple[Any, list[ca.SX]]) -> Any:
+        """What an effect makes of a value; the rates of its states are kept."""
         value, rates = result
         if rates:
-            dz[effect.label] = rates
+            self.rates[effect.label] = rates
         return value
 
-    # Torque path: what the drive reports, if there is one -> motor -> transmission -> joint.
-    torques, starts = [], {}
-    driving = dict(zip(mechanism.joints, torque_inputs, strict=True))
-    for joint, row in mechanism.all_joints.items():
-        here = [e for e in effects if e.site == joint or e.site == 'all']
-        joint_row = ca.mtimes(ca.DM([row]), kinematics.basis)
-        angle, rate = ca.mtimes(joint_row, s), ca.mtimes(joint_row, ds)
-        load, share = driving.get(joint, ca.SX(0)), ca.SX(0)
+    def torques(self) -> list[ca.SX]:
+        """Torque at each joint: what the drive reports, if there is one, motor, transmission."""
+        driving = {j: self.input[i] for j, i in zip(
+            self.mechanism.joints, self.mechanism.inputs, strict=True)}  # fmt: skip
+        return [
+            self._torque(joint, row, driving.get(joint, ca.SX(0)))
+            for joint, row in self.mechanism.all_joints.items()
+        ]
+
+    def _torque(self, joint: str, row: Sequence[float], load: ca.SX) -> ca.SX:
+        here, own = [e for e in self.effects if e.site == joint or e.site == 'all'], self.own
+        joint_row = ca.mtimes(ca.DM([row]), self.kinematics.basis)
+        angle, rate, share = ca.mtimes(joint_row, self.s), ca.mtimes(joint_row, self.ds), ca.SX(0)
         for e in here:
             load = e.command(load, angle, rate, own[e.label])
         for hook in ('deliver', 'transmit', 'joint_torque'):
@@ -167,7 +241,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
             for e in here:
                 if not overrides(e, hook):
                     continue
-                zs, ps = z_of[e.label], own[e.label]
+                zs, ps = self.states[e.label], own[e.label]
                 at_start = load
                 if hook == 'transmit' and (rotor := e.rotor(zs, ps)) is not None:
                     a, w, on_rotor = rotor
@@ -177,144 +251,126 @@ def assemble(model: Model, setup: Setup) -> Equations:
                     load += opposing
                     share += on_rotor * (1 - share)
                 if e.states:
-                    starts[e.label] = e.initial_states(angle, rate, at_start, own[e.label])
+                    self.settled[e.label] = e.initial_states(angle, rate, at_start, ps)
                 if hook == 'deliver':
-                    load = pass_through(e, e.deliver(load, zs, ps))
+                    load = self._passed(e, e.deliver(load, zs, ps))
                 elif hook == 'transmit':
-                    load = pass_through(e, e.transmit(load, angle, rate, zs, ps))
+                    load = self._passed(e, e.transmit(load, angle, rate, zs, ps))
                 else:
-                    torque = pass_through(e, e.joint_torque(angle, rate, load, zs, ps))
+                    torque = self._passed(e, e.joint_torque(angle, rate, load, zs, ps))
                     added += torque * (1 - share) if divides(e) else torque
             load = load + added
-        torques.append(load)
+        return load
 
-    # Bodies: energies, springs, forces.
-    q, v = ca.SX.sym('q', kinematics.basis.shape[0]), ca.SX.sym('v', kinematics.basis.shape[0])
-    up = mechanism.up(setup)
-    for e in effects:
-        up = e.up(up, own[e.label])
-    body = Body(mechanism, setup, q, v, by_name, up, foot=ca.SX.zeros(mechanism.dimensions))
-    displaced = [e.foot(body, own[e.label]) for e in effects if overrides(e, 'foot')]
-    body = replace(body, foot=sum(displaced, body.foot))
-    a = ca.SX.sym('a', *s.shape)
-    recursion = mechanism.recursion(q, v, ca.mtimes(kinematics.basis, a), by_name, up)
-    energies = mechanism.energies(q, v, by_name, setup, up, body.foot)
-    # What recursion does not give is derived from the energies.
-    kinetic, potential = energies if recursion is None else (ca.SX(0), ca.SX(0))
-    for stretch, stiffness in body.springs():
-        potential += stiffness * stretch**2 / 2
-    force = ca.SX.zeros(q.shape)
-    full = [
-        ca.mtimes(kinematics.basis, s) + kinematics.offset, ca.mtimes(kinematics.basis, ds)
-    ]  # fmt: skip
-    for e in effects:
-        more_kinetic, more_potential = e.energies(body, own[e.label])
-        kinetic, potential = kinetic + more_kinetic, potential + more_potential
-        if overrides(e, 'force'):
-            force += pass_through(e, e.force(body, z_of[e.label], own[e.label]))
+    def dynamics(self, torques: Sequence[ca.SX]) -> _Dynamics:
+        """What bodies, springs and forces make of the torques at the joints."""
+        mechanism, basis, q, v = self.mechanism, self.kinematics.basis, self.q, self.v
+        up = mechanism.up(self.setup)
+        for e in self.effects:
+            up = e.up(up, self.own[e.label])
+        still = ca.SX.zeros(mechanism.dimensions)
+        body = Body(mechanism, self.setup, q, v, self.by_name, up, foot=still)
+        moved = [e.foot(body, self.own[e.label]) for e in self.effects if overrides(e, 'foot')]
+        body = replace(body, foot=sum(moved, body.foot))
+        a = ca.SX.sym('a', *self.s.shape)
+        recursion = mechanism.recursion(q, v, ca.mtimes(basis, a), self.by_name, up)
+        energies = mechanism.energies(q, v, self.by_name, self.setup, up, body.foot)
+        # What recursion does not give is derived from the energies.
+        kinetic, potential = energies if recursion is None else (ca.SX(0), ca.SX(0))
+        for stretch, stiffness in body.springs():
+            potential += stiffness * stretch**2 / 2
+        for e in self.effects:
+            more_kinetic, more_potential = e.energies(body, self.own[e.label])
+            kinetic, potential = kinetic + more_kinetic, potential + more_potential
+        force = self._force(body, torques)
+        kinetic, potential, force = self._in_free([kinetic, potential, force])
+        mass_matrix, bias = manipulator(kinetic, potential, self.s, self.ds)
+        load = ca.mtimes(basis.T, force) - bias
+        imbalance = load - ca.mtimes(mass_matrix, a)
+        energy = kinetic + potential
+        if recursion is not None:
+            own_mass, taken = recursion
+            taken, own_mass, own_energy = self._in_free(
+                [
+                    ca.mtimes(basis.T, taken),
+                    ca.mtimes([basis.T, own_mass, basis]),
+                    energies[0] + energies[1],
+                ]
+            )
+            load -= ca.substitute(taken, a, ca.SX.zeros(a.shape))
+            imbalance -= taken
+            mass_matrix += own_mass
+            energy += own_energy
+        return _Dynamics(mass_matrix, load, a, imbalance, energy)
+
+    def _force(self, body: Body, torques: Sequence[ca.SX]) -> ca.SX:
+        """Generalised force of effects on bodies and of the torques at the joints."""
+        force = ca.SX.zeros(self.q.shape)
+        for e in self.effects:
+            if not overrides(e, 'force'):
+                continue
+            force += self._passed(e, e.force(body, self.states[e.label], self.own[e.label]))
             if e.states:
-                lean, rate = full[0][body.stance], full[1][body.stance]
-                starts[e.label] = e.initial_states(lean, rate, ca.SX(0), own[e.label])
-    for row, torque in zip(mechanism.all_joints.values(), torques, strict=True):
-        force += ca.DM(row) * torque
-    kinetic, potential, force = ca.substitute([kinetic, potential, force], [q, v], full)
-    mass_matrix, bias = manipulator(kinetic, potential, s, ds)
-    load = ca.mtimes(kinematics.basis.T, force) - bias
-    imbalance = load - ca.mtimes(mass_matrix, a)
-    energy = kinetic + potential
-    if recursion is not None:
-        own_mass, taken = recursion
-        taken, own_mass, own_energy = ca.substitute(
-            [ca.mtimes(kinematics.basis.T, taken),
-             ca.mtimes([kinematics.basis.T, own_mass, kinematics.basis]), sum(energies)],
-            [q, v], full,
-        )  # fmt: skip
-        load -= ca.substitute(taken, a, ca.SX.zeros(a.shape))
-        imbalance -= taken
-        mass_matrix += own_mass
-        energy += own_energy
-    acceleration = solve_small(mass_matrix, load)
+                lean, rate = (value[body.stance] for value in self.full)
+                self.settled[e.label] = e.initial_states(lean, rate, ca.SX(0), self.own[e.label])
+        for row, torque in zip(self.mechanism.all_joints.values(), torques, strict=True):
+            force += ca.DM(row) * torque
+        return force
 
-    # Sensors.
-    outputs = mechanism.sensors(*full)
-    moving = {reading_rate(c): ca.jtimes(y, s, ds) for c, y in outputs.items()}
-    for e in effects:
-        if overrides(e, 'read'):
+    def readings(self) -> dict[str, ca.SX]:
+        """What the sensors report, before any delay, by channel."""
+        outputs = self.mechanism.sensors(*self.full)
+        moving = {reading_rate(c): ca.jtimes(y, self.s, self.ds) for c, y in outputs.items()}
+        for e in self.effects:
+            if not overrides(e, 'read'):
+                continue
+            zs, ps = self.states[e.label], self.own[e.label]
             if e.states:
-                starts[e.label] = e.initial_readings(outputs, own[e.label])
-            outputs = pass_through(e, e.read(outputs, z_of[e.label], own[e.label] | moving))
+                self.settled[e.label] = e.initial_readings(outputs, ps)
+            outputs = self._passed(e, e.read(outputs, zs, ps | moving))
+        return outputs
 
-    input_delay = ca.SX(0)
-    output_delays = {channel: ca.SX(0) for channel in outputs}
-    for e in effects:
-        delay = e.input_delay(own[e.label])
-        input_delay += 0 if delay is None else delay
-        for channel in outputs:
-            late = e.output_delay(channel, own[e.label])
-            output_delays[channel] += 0 if late is None else late
-    rates = [ca.substitute(dz[e.label], [q, v], full) for e in effects if e.states]
-    return Equations(
-        x=x,
-        u=u,
-        p=p,
-        rates=ca.vertcat(ds, acceleration, *(r for group in rates for r in group)),
-        outputs=ca.vertcat(*outputs.values()),
-        initial=ca.vertcat(s, ds, *_start(effects, starts, z_of, own)),
-        input_delay=input_delay,
-        output_delays=ca.vertcat(*output_delays.values()),
-        mass_matrix=mass_matrix,
-        load=load,
-        acceleration=a,
-        imbalance=imbalance,
-        energy=energy,
-        state_names=(
-            *kinematics.names,
-            *(f'd{name}/dt' for name in kinematics.names),
-            *extra,
-        ),
-        parameter_names=names,
-        input_names=(*mechanism.inputs, *extra_inputs),
-        channels=tuple(outputs),
-        coordinates=m,
-        state_scales=(
-            *(1.0 for _ in range(2 * m)),
-            *(scale for e in effects for scale in e.state_scales or (1.0,) * len(e.states)),
-        ),
-        largest_step=min((e.largest_step for e in effects), default=float('inf')),
-    )
+    def delays(self, channels: Iterable[str]) -> tuple[ca.SX, list[ca.SX]]:
+        """Delay of the inputs and of each output, s."""
+        late_input, late = ca.SX(0), dict.fromkeys(channels, ca.SX(0))
+        for e in self.effects:
+            delay = e.input_delay(self.own[e.label])
+            late_input += 0 if delay is None else delay
+            for channel in late:
+                delay = e.output_delay(channel, self.own[e.label])
+                late[channel] = late[channel] + (0 if delay is None else delay)
+        return late_input, list(late.values())
 
+    def state_rates(self) -> list[ca.SX]:
+        """Rates of the extra states, in the order of the effects."""
+        rates = [self._in_free(self.rates[e.label]) for e in self.effects if e.states]
+        return [r for group in rates for r in group]
 
-def _start(
-    effects: Sequence[Effect],
-    starts: Mapping[str, list[ca.SX]],
-    states: Mapping[str, list[ca.SX]],
-    own: Mapping[str, Mapping[str, ca.SX]],
-) -> list[ca.SX]:
-    """Extra states at the start, in the order of the effects.
+    def starts(self) -> list[ca.SX]:
+        """Extra states at the start, in the order of the effects.
 
-    Args:
-        effects: Those that act.
-        starts: Label -> settled states, in the order along the torque path and to the sensors: of
-            symbols of the motion and of states before them.
-        states: Label -> their symbols, which say here how far they are from settled.
-        own: Label -> its parameters.
-    """
-    by_label = {e.label: e for e in effects}
-    before: list[ca.SX] = []
-    at_start: list[ca.SX] = []
-    found = {}
-    for label, settled in starts.items():
-        # What comes before starts first: a spring is wound up by the lagging torque's start.
-        if before:
-            settled = ca.substitute(settled, before, at_start)
-        spreads = by_label[label].start_spreads(own[label])
-        found[label] = [
-            start + spread * away
-            for start, spread, away in zip(settled, spreads, states[label], strict=True)
-        ]
-        before += states[label]
-        at_start += found[label]
-    return [start for e in effects if e.states for start in found[e.label]]
+        Their symbols say here how far they are from settled.
+        """
+        by_label = {e.label: e for e in self.effects}
+        before: list[ca.SX] = []
+        at_start: list[ca.SX] = []
+        found = {}
+        for label, settled in self.settled.items():
+            # What comes before starts first: a spring is wound up by the lagging torque's start.
+            if before:
+                settled = ca.substitute(settled, before, at_start)
+            spreads = by_label[label].start_spreads(self.own[label])
+            found[label] = [
+                start + spread * away
+                for start, spread, away in zip(settled, spreads, self.states[label], strict=True)
+            ]
+            before += self.states[label]
+            at_start += found[label]
+        return [start for e in self.effects if e.states for start in found[e.label]]
+
+    def _in_free(self, expressions: list[ca.SX]) -> list[ca.SX]:
+        """Expressions of all coordinates in free ones."""
+        return ca.substitute(expressions, [self.q, self.v], self.full)
 
 
 def divides(effect: Effect) -> bool:
