@@ -97,99 +97,148 @@ def minimise(
         trial: The start, where it has been simulated already.
         kept: Unknowns that stay where they are, shape (k,).
     """
-    lower = np.array(
-        [
-            u.to_coordinate(max(u.lower, 1e-300) if u.logarithmic else u.lower)
-            for u in problem.unknowns
-        ]
-    )
-    upper = np.array([u.to_coordinate(u.upper) for u in problem.unknowns])
-    here = trial or attempt(problem, theta, motions, horizon)
-    point = here.point(weight) if here is not None else None
-    if point is None:
+    start = trial or attempt(problem, theta, motions, horizon)
+    if start is None or start.point(weight) is None:
         return Descent(theta, motions, None, False)
-    began = float(point.cost)
-    errors = [error_of(point)]
-
-    def frozen(theta, point):
-        """Unknowns that stay where they are, shape (k,)."""
-        _, gradient, _ = reduced(point, 0.0)
-        at_bounds = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
-        if kept is not None:
-            at_bounds |= kept
-        return at_bounds | _unseen(problem, theta, point, weight) if leading else at_bounds
-
-    # The border's weight follows what is still to be gained (a central path): whoever meets the
-    # border early creeps along it ever after.
-    barrier = max(BARRIER, CENTRAL * min(_promised(point, frozen(theta, point)), point.cost))
-    point = point.beside(BARRIER, barrier)
-
-    def end(converged: bool, hopeless: bool = False) -> Descent:
-        assert point is not None
-        there = point.beside(barrier, BARRIER)
-        return Descent(
-            theta, motions, there, converged, here, hopeless, damping, began - float(there.cost)
-        )
-
-    def ahead(theta, motions, point, damping):
-        """Where a damped Gauss-Newton step from a point leads."""
-        step, factors = _step(point, damping, frozen(theta, point))
-        reached = np.clip(theta + _straight(problem, step), lower, upper)
-        step = reached - theta
-        return attempt(problem, reached, moved(problem, motions, factors, step), horizon)
-
-    def cost_of(trial):
-        """Of a trial; infinite where the simulation runs away."""
-        return np.inf if trial is None else trial.cost(weight, barrier)
-
-    def point_of(trial):
-        """Its normal equations; None where there are none."""
-        there = None if trial is None else trial.point(weight)
-        return None if there is None else there.beside(BARRIER, barrier)
-
+    way = _Way(problem, horizon, weight, leading, valley, kept, start, theta, motions, damping)
     for _ in range(iterations):
         check_time()
-        if out_of_reach(errors, reach):
-            return end(False, hopeless=True)
-        trial = ahead(theta, motions, point, damping)
-        if trial is not None and here and not cost_of(trial) < point.cost:
-            trial = settled(trial, here, weight)
-        for _ in range(BACK if error_of(point) < CLOSE else 0):
-            if not point.cost < cost_of(trial) < valley.uphill * point.cost:
+        if out_of_reach(way.errors, reach):
+            return way.end(False, hopeless=True)
+        converged = way.step(drift)
+        if converged is not None:
+            return way.end(converged)
+    return way.end(False)
+
+
+class _Way:
+    """The way downhill from a trial that can be simulated: where it is, and how to go on.
+
+    Attributes:
+        errors: chi2/N of all points so far, and again that of one from which no step gained.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        horizon: float,
+        weight: float,
+        leading: bool,
+        valley: Valley,
+        kept: np.ndarray | None,
+        start: Trial,
+        theta: np.ndarray,
+        motions: list[np.ndarray],
+        damping: float,
+    ):
+        self._problem, self._horizon, self._weight = problem, horizon, weight
+        self._leading, self._valley, self._kept = leading, valley, kept
+        ends = np.array([u.ends for u in problem.unknowns]).reshape(-1, 2)
+        self._lower, self._upper = ends.T
+        point = start.point(weight)
+        assert point is not None
+        self._here, self._theta, self._motions, self._damping = start, theta, motions, damping
+        self._began, self.errors = float(point.cost), [error_of(point)]
+        # The border's weight follows what is still to be gained (a central path): whoever meets
+        # the border early creeps along it ever after.
+        promised = _promised(point, self._frozen(theta, point))
+        self._barrier = max(BARRIER, CENTRAL * min(promised, point.cost))
+        self._point = point.beside(BARRIER, self._barrier)
+
+    def end(self, converged: bool, hopeless: bool = False) -> Descent:
+        """Where it has come to."""
+        there = self._point.beside(self._barrier, BARRIER)
+        return Descent(
+            self._theta, self._motions, there, converged, self._here, hopeless, self._damping,
+            self._began - float(there.cost),
+        )  # fmt: skip
+
+    def step(self, drift: float) -> bool | None:
+        """One step, taken where it gains.
+
+        Returns:
+            None to go on; else whether this is a minimum.
+        """
+        trial = self._ahead(self._theta, self._motions, self._point, self._damping)
+        if trial is not None and not self._cost(trial) < self._point.cost:
+            trial = settled(trial, self._here, self._weight)
+        trial = self._back(trial)
+        tried = self._cost(trial)
+        there = self._normal(trial) if tried < self._point.cost else None
+        if trial is None or there is None:
+            return self._shortened(tried)
+        return self._taken(trial, there, drift)
+
+    def _back(self, trial: Trial | None) -> Trial | None:
+        """After a step uphill, back to the floor of its valley."""
+        for _ in range(BACK if error_of(self._point) < CLOSE else 0):
+            if not self._point.cost < self._cost(trial) < self._valley.uphill * self._point.cost:
                 break
-            # A step along a curved valley leaves its floor: back to it, across the valley.
-            uphill = point_of(trial)
-            if uphill is None:
+            uphill = self._normal(trial)
+            if trial is None or uphill is None:
                 break
-            back = ahead(trial.theta, trial.motions, uphill, max(valley.across, damping))
-            if cost_of(back) > cost_of(trial):
+            damping = max(self._valley.across, self._damping)
+            back = self._ahead(trial.theta, trial.motions, uphill, damping)
+            if self._cost(back) > self._cost(trial):
                 break
             trial = back
-        tried = cost_of(trial)
-        candidate = point_of(trial) if tried < point.cost else None
-        if candidate is not None:
-            gain = point.cost - candidate.cost
-            here, theta, motions, point = trial, trial.theta, trial.motions, candidate
-            errors.append(error_of(point))
-            damping = max(damping / 10, 1e-9)
-            small = max(drift * candidate.cost, SMALL_GAIN)
-            little = gain < small and barrier <= max(BARRIER, CENTRAL * small)
-            # A short step gains little too.
-            if little and _promised(point, frozen(theta, point)) < small:
-                return end(True)
-            lower_barrier = max(BARRIER, min(barrier, CENTRAL * gain))
-            point, barrier = point.beside(barrier, lower_barrier), lower_barrier
-        else:
-            if point.cost <= tried < (1 + 1e-9) * point.cost:
-                return end(True)
-            if damping > SHORT:
-                # Before, a step that gains nothing only says that it was too long.
-                errors.append(error_of(point))
-            damping *= 10
-            if damping > 1e8:
-                # No step is short enough: a minimum, or a corner of what bodies can be.
-                return end(bool(point.cost <= tried < np.inf))
-    return end(False)
+        return trial
+
+    def _taken(self, trial: Trial, there: Point, drift: float) -> bool | None:
+        gain = self._point.cost - there.cost
+        self._here, self._theta, self._motions = trial, trial.theta, trial.motions
+        self._point = there
+        self.errors.append(error_of(there))
+        self._damping = max(self._damping / 10, 1e-9)
+        small = max(drift * there.cost, SMALL_GAIN)
+        little = gain < small and self._barrier <= max(BARRIER, CENTRAL * small)
+        # A short step gains little too.
+        if little and _promised(there, self._frozen(self._theta, there)) < small:
+            return True
+        lower = max(BARRIER, min(self._barrier, CENTRAL * gain))
+        self._point, self._barrier = there.beside(self._barrier, lower), lower
+        return None
+
+    def _shortened(self, tried: float) -> bool | None:
+        """A shorter step next time; `tried` is the cost of this one."""
+        if self._point.cost <= tried < (1 + 1e-9) * self._point.cost:
+            return True
+        if self._damping > SHORT:
+            # Before, a step that gains nothing only says that it was too long.
+            self.errors.append(error_of(self._point))
+        self._damping *= 10
+        if self._damping > 1e8:
+            # No step is short enough: a minimum, or a corner of what bodies can be.
+            return bool(self._point.cost <= tried < np.inf)
+        return None
+
+    def _frozen(self, theta: np.ndarray, point: Point) -> np.ndarray:
+        """Unknowns that stay where they are, shape (k,)."""
+        _, gradient, _ = reduced(point, 0.0)
+        held = (theta <= self._lower) & (gradient > 0) | (theta >= self._upper) & (gradient < 0)
+        if self._kept is not None:
+            held |= self._kept
+        if self._leading:
+            held |= _unseen(self._problem, theta, point, self._weight)
+        return held
+
+    def _ahead(
+        self, theta: np.ndarray, motions: list[np.ndarray], point: Point, damping: float
+    ) -> Trial | None:
+        """Where a damped Gauss-Newton step from a point leads."""
+        step, factors = _step(point, damping, self._frozen(theta, point))
+        reached = np.clip(theta + _straight(self._problem, step), self._lower, self._upper)
+        motions = moved(self._problem, motions, factors, reached - theta)
+        return attempt(self._problem, reached, motions, self._horizon)
+
+    def _cost(self, trial: Trial | None) -> float:
+        """Of a trial; infinite where the simulation runs away."""
+        return np.inf if trial is None else trial.cost(self._weight, self._barrier)
+
+    def _normal(self, trial: Trial | None) -> Point | None:
+        """Its normal equations; None where there are none."""
+        there = None if trial is None else trial.point(self._weight)
+        return None if there is None else there.beside(BARRIER, self._barrier)
 
 
 def error_of(point: Point) -> float:

@@ -180,7 +180,7 @@ def _descend(
     """
     prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
     theta = np.array([
-        np.clip(u.to_coordinate(at.get(u.name, u.prior)), *_range(u)) for u in unknowns
+        np.clip(u.to_coordinate(at.get(u.name, u.prior)), *u.ends) for u in unknowns
     ])  # fmt: skip
     tolerance = np.array([u.tolerance for u in unknowns])
 
@@ -208,7 +208,7 @@ def _descend(
         while not better and damping < MOST_DAMPING:
             step = np.linalg.lstsq(h + damping * np.diag(np.diag(h) + 1e-12), -g, rcond=None)[0]
             tried = np.array([
-                np.clip(t + s, *_range(u)) for t, s, u in zip(theta, step, unknowns, strict=True)
+                np.clip(t + s, *u.ends) for t, s, u in zip(theta, step, unknowns, strict=True)
             ])  # fmt: skip
             new_residual = residuals(problems, unknowns, tried)
             new_cost = deviance_of(new_residual, tried)
@@ -425,12 +425,6 @@ def _parameters(problem: Problem, unknowns: Sequence[Unknown], theta: np.ndarray
     p = problem.vector.copy()
     p[problem.places] = [u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)]
     return p
-
-
-def _range(u: Unknown) -> tuple[float, float]:
-    if not u.logarithmic:
-        return u.lower, u.upper
-    return u.to_coordinate(max(u.lower, 1e-300)), u.to_coordinate(u.upper)
 
 
 def apart(model: Model) -> tuple[Model, tuple[Effect, ...]]:

@@ -16,6 +16,9 @@ class IdentificationError(ValueError):
     """An identification that cannot be done; the message says why."""
 
 
+NOTHING = 1e-300  # instead of 0, of which there is no logarithm
+
+
 @dataclass(frozen=True)
 class Unknown:
     """A shared parameter to be identified, in the coordinate in which it is moved.
@@ -46,6 +49,13 @@ class Unknown:
     def to_coordinate(self, value: float) -> float:
         """Value -> coordinate."""
         return float(np.log(value)) if self.logarithmic else value
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Smallest and largest coordinate."""
+        if not self.logarithmic:
+            return self.lower, self.upper
+        return self.to_coordinate(max(self.lower, NOTHING)), self.to_coordinate(self.upper)
 
     def to_value(self, coordinate: float) -> float:
         """Coordinate -> value."""
