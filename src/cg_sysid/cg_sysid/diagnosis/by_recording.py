@@ -25,7 +25,7 @@ from cg_sysid.search import settings
 from cg_sysid.search.nuisance import turning
 from cg_sysid.search.outcome import Outcome
 from cg_sysid.search.starts import started_from
-from cg_sysid.search.task import candidates_for
+from cg_sysid.search.task import EffectAt, candidates_for
 
 FEWEST_RECORDINGS = 3  # recordings: two always differ
 MOST_RECORDINGS = 30  # recordings; of more, as the steps of a walk, none is a session
@@ -103,7 +103,7 @@ def _wandering(
 
 def numbers_of(
     model: Model, data_sets: Sequence[DataSet], names: Sequence[str] | None
-) -> Iterator[tuple[str, str | None]]:
+) -> Iterator[EffectAt]:
     """(Effect, place) of those that have one number, their size; of the model or not."""
     stated = [(effect.name, effect.at) for effect in model.effects]
     lacking = candidates_for(model, [data_set.setup for data_set in data_sets], names)

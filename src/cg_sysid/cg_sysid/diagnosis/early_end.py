@@ -10,7 +10,7 @@ from cg_sysid.search.model_selection import share_explained
 from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.standings import Unfinished
-from cg_sysid.search.task import candidates_for
+from cg_sysid.search.task import EffectAt, candidates_for
 
 
 def answer_so_far(work: Workspace, nominal: Outcome) -> Diagnosis:
@@ -64,6 +64,6 @@ def unfinished(work: Workspace, final: Outcome, left: bool) -> Unfinished:
     )  # fmt: skip
 
 
-def _label(work: Workspace, candidate: tuple[str, str | None]) -> str:
+def _label(work: Workspace, candidate: EffectAt) -> str:
     name, at = candidate
     return LIBRARY[name](work.nominal.mechanism, at).label

@@ -33,13 +33,13 @@ from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.ranking import per_output
 from cg_sysid.search.starts import starts_of
-from cg_sysid.search.task import Task, effect_of, eventful
+from cg_sysid.search.task import EffectAt, Task, effect_of, eventful
 from cg_sysid.search.whole_fit import try_candidate
 
 log = logging.getLogger(__name__)
 
 
-Effects = Sequence[tuple[str, str | None]]
+Effects = Sequence[EffectAt]
 
 
 class SuccessiveHalving:
@@ -101,7 +101,7 @@ class SuccessiveHalving:
                 return replace(screening, task=task)  # to torques small faults change little
         return None
 
-    def far_behind(self, base: Task, label: str) -> set[tuple[str, str | None]]:
+    def far_behind(self, base: Task, label: str) -> set[EffectAt]:
         """Effects that were out of reach of one of them at a first look.
 
         On the causes of this base, without small faults.

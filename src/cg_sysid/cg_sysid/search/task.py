@@ -16,6 +16,8 @@ from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.search import settings
 from cg_sysid.search.nuisance import Bounds
 
+EffectAt = tuple[str, str | None]  # name of an effect, and where it acts
+
 
 @dataclass(frozen=True, eq=False)
 class Rival:
@@ -55,7 +57,7 @@ class Task:
     """
 
     model: Model
-    effect: tuple[str, str | None] | None = None
+    effect: EffectAt | None = None
     events: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     bounds: Bounds = field(default_factory=dict)
     warm_starts: tuple[Fit, ...] = ()
@@ -74,7 +76,7 @@ def candidates_for(
     names: Sequence[str] | None = None,
     recorded: Collection[str] = (),
     small: Collection[str] = (),
-) -> list[tuple[str, str | None]]:
+) -> list[EffectAt]:
     """(effect, at) of all that could show in these set-ups and that the model does not have.
 
     What the model has as a small fault (labels in `small`) can still be a cause, as a large one.

@@ -38,10 +38,11 @@ from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.measured_motion import STRIDE_S, Motion, noise_gains
 from cg_sysid.identification.student_t import row_scale, spread_of
 from cg_sysid.identification.torque_error import Problem, TorqueFit
-from cg_sysid.identification.unknowns import unknowns_of
+from cg_sysid.identification.unknowns import Unknown, unknowns_of
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.starts import starts_of
+from cg_sysid.search.task import EffectAt
 
 FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
@@ -73,12 +74,12 @@ class Scores:
         pushed: What pushes once, where it may have: (effect, place).
     """
 
-    gains: dict[tuple[str, str | None], float]
-    fitted: dict[tuple[str, str | None], float]
+    gains: dict[EffectAt, float]
+    fitted: dict[EffectAt, float]
     worst: tuple[str, ...]
-    pushed: tuple[tuple[str, str | None], ...] = ()
+    pushed: tuple[EffectAt, ...] = ()
 
-    def worth(self, candidates: Sequence[tuple[str, str | None]]) -> list[tuple[str, str | None]]:
+    def worth(self, candidates: Sequence[EffectAt]) -> list[EffectAt]:
         """Those to be looked at."""
         # A sensor is judged beside sensors: laws of torque may gain by what they make of masses.
         sensors = {c: gain for c, gain in self.gains.items() if _sensed(c[0]) and not _late(c[0])}
@@ -108,7 +109,7 @@ class Scores:
         }
         return [c for c in candidates if c in seen or c in unseen or c in self.pushed]
 
-    def best(self) -> list[tuple[tuple[str, str | None], float]]:
+    def best(self) -> list[tuple[EffectAt, float]]:
         """Candidates that torque fits speak for, and their nats, the best first."""
         ordered = sorted(self.fitted.items(), key=lambda item: -item[1])
         return [(candidate, nats) for candidate, nats in ordered if nats > SEEN]
@@ -117,7 +118,7 @@ class Scores:
 def scores(
     model: Model,
     train: Sequence[DataSet],
-    candidates: Sequence[tuple[str, str | None]],
+    candidates: Sequence[EffectAt],
     bounds: Bounds,
     carry_out: CarryOut = one_by_one,
     held: Sequence[DataSet] = (),
@@ -140,70 +141,112 @@ def scores(
     """
     if len(model.mechanism.coordinates) < FEWEST_JOINTS or not torque_error.can(model):
         return None
-    plain = torque_error.without_states(model)
-    declared = plain.declarations
-    unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
-    fitted = torque_error.fit_by_torque(plain, train, None, bounds)
-    problems = torque_error.problems_of(plain, train, unknowns)
-    if fitted is None or not problems:
+    base = _Base.of(model, train, bounds)
+    if base is None:
         return None
-    theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
-    prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
-    tolerance = np.array([u.tolerance for u in unknowns])
-    residual = torque_error.residuals(problems, unknowns, theta)
-    jacobian = torque_error.derivatives(problems, unknowns, theta)
-    # Few rows are far off, where friction turns within a window: they count less, as in fits.
-    scale = row_scale(residual, fitted.scale)
-    known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
-    # The belief is as good as measurements of the numbers themselves.
-    belief = np.diag(1 / tolerance)
-    orthonormal, _ = np.linalg.qr(np.vstack([known, belief[np.isfinite(tolerance)]]))
-    left = np.concatenate([(residual / scale).ravel(), ((theta - prior) / tolerance)[
-        np.isfinite(tolerance)]])  # fmt: skip
-    left = left - orthonormal @ (orthonormal.T @ left)
-    values = plain.with_values(fitted.values)
-    problems = _as_predicted(plain, problems, residual)
-    by_motion = [_by_motion(problem, values) for problem in problems]
-    gains: dict[tuple[str, str | None], float] = {}
-    promising: dict[tuple[str, str | None], list[int]] = {}
-    for name, at in candidates:
-        columns = _columns(values, name, at, problems, by_motion)
-        if columns is None:
-            continue
-        of_starts = []
-        for start in columns:
-            d = np.zeros((len(left), start.shape[2]))
-            d[: residual.size] = (start / scale[:, :, None]).reshape(residual.size, -1)
-            d -= orthonormal @ (orthonormal.T @ d)
-            solution, *_ = np.linalg.lstsq(d, -left, rcond=1e-9)
-            rest = left + d @ solution
-            of_starts.append(float(left @ left - rest @ rest) / 2)
-        gains[name, at] = max(0.0, *of_starts)
-        promising[name, at] = [int(k) for k in np.argsort(of_starts)[::-1][:STARTS]]
-    noise = _noise(train[0], by_motion)
-    order = np.argsort(-fitted.rms / np.maximum(noise, 1e-12))
+    tests = {c: said for c in candidates if (said := base.score_tests(*c)) is not None}
+    gains = {c: max(0.0, *of_starts) for c, of_starts in tests.items()}
     free = model.mechanism.kinematics(train[0].setup).names
+    noise = _noise(train[0], base.by_motion)
+    order = np.argsort(-base.fitted.rms / np.maximum(noise, 1e-12))
     worst = _worst([free[k] for k in order], missed or {})
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
+    promising = {c: [int(k) for k in np.argsort(tests[c])[::-1][:STARTS]] for c in follow}
     for name, at in candidates:
         effect = LIBRARY[name](model.mechanism, at)
         if (name, at) in gains or effect.states or _sensed(name):
             continue
         if _on_worst(name, at, worst):
-            follow.append((name, at))
             promising[name, at] = list(range(len(starts_of(effect))))[:STARTS]
     gained = carry_out(
         _gain_by_fit,
-        [(plain, c, promising[c], train, bounds, fitted) for c in follow],
+        [(base.plain, c, starts, train, bounds, base.fitted) for c, starts in promising.items()],
         'what torques say',
     )
-    by_fit = dict(zip(follow, gained, strict=True))
-    pushed: tuple[tuple[str, str | None], ...] = ()
-    if pushers := [c for c in candidates if _happens(c[0])]:
-        problems = torque_error.problems_of(plain, [*train, *held], unknowns)
-        residual = torque_error.residuals(problems, unknowns, theta)
-        pushed = _pushed(values, pushers, [p.motion for p in problems], residual, free)
+    by_fit = dict(zip(promising, gained, strict=True))
+    pushers = [c for c in candidates if _happens(c[0])]
+    pushed = base.pushed(pushers, [*train, *held], free) if pushers else ()
     return Scores(gains, by_fit, worst, pushed)
+
+
+@dataclass(frozen=True)
+class _Base:
+    """What the torques leave of a base, for score tests on top of it.
+
+    Attributes:
+        plain: The model without states.
+        model: The same with the numbers that the torques say.
+        unknowns: Those of its numbers that torques see.
+        theta: Their coordinates, shape (k,).
+        fitted: The torque fit.
+        problems: Motions, with the torques that the model predicts.
+        by_motion: Derivatives of the torques by the motion, of each of these.
+        scale: By which to divide each residual, shape (rows, m).
+        taken: Orthonormal columns: what its numbers and beliefs can take.
+        left: Weighted residual and beliefs, less that.
+    """
+
+    plain: Model
+    model: Model
+    unknowns: tuple[Unknown, ...]
+    theta: np.ndarray
+    fitted: TorqueFit
+    problems: list[Problem]
+    by_motion: list[np.ndarray]
+    scale: np.ndarray
+    taken: np.ndarray
+    left: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model, train: Sequence[DataSet], bounds: Bounds) -> '_Base | None':
+        """A model fitted by torques; None where they say nothing of it."""
+        plain = torque_error.without_states(model)
+        declared = plain.declarations
+        unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
+        fitted = torque_error.fit_by_torque(plain, train, None, bounds)
+        problems = torque_error.problems_of(plain, train, unknowns)
+        if fitted is None or not problems:
+            return None
+        theta = np.array([u.to_coordinate(fitted.values[u.name]) for u in unknowns])
+        prior = np.array([u.to_coordinate(u.prior) for u in unknowns])
+        tolerance = np.array([u.tolerance for u in unknowns])
+        residual = torque_error.residuals(problems, unknowns, theta)
+        jacobian = torque_error.derivatives(problems, unknowns, theta)
+        # Few rows are far off, where friction turns within a window: they count less, as in fits.
+        scale = row_scale(residual, fitted.scale)
+        known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
+        # The belief is as good as measurements of the numbers themselves.
+        believed = np.isfinite(tolerance)
+        belief = np.diag(1 / tolerance)[believed]
+        taken, _ = np.linalg.qr(np.vstack([known, belief]))
+        off = ((theta - prior) / tolerance)[believed]
+        left = np.concatenate([(residual / scale).ravel(), off])
+        values = plain.with_values(fitted.values)
+        problems = _as_predicted(plain, problems, residual)
+        by_motion = [_by_motion(problem, values) for problem in problems]
+        return cls(plain, values, unknowns, theta, fitted, problems, by_motion, scale, taken,
+                   left - taken @ (taken.T @ left))  # fmt: skip
+
+    def score_tests(self, name: str, at: str | None) -> list[float] | None:
+        """Nats that a candidate could gain from each of its starts; None of one without a D."""
+        columns = _columns(self.model, name, at, self.problems, self.by_motion)
+        return None if columns is None else [self._score(start) for start in columns]
+
+    def _score(self, columns: np.ndarray) -> float:
+        d = np.zeros((len(self.left), columns.shape[2]))
+        d[: self.scale.size] = (columns / self.scale[:, :, None]).reshape(self.scale.size, -1)
+        d -= self.taken @ (self.taken.T @ d)
+        solution, *_ = np.linalg.lstsq(d, -self.left, rcond=1e-9)
+        rest = self.left + d @ solution
+        return float(self.left @ self.left - rest @ rest) / 2
+
+    def pushed(
+        self, pushers: Sequence[EffectAt], data_sets: Sequence[DataSet], free: Sequence[str]
+    ) -> tuple[EffectAt, ...]:
+        """Of those that push once, who may have in one of these records."""
+        problems = torque_error.problems_of(self.plain, data_sets, self.unknowns)
+        residual = torque_error.residuals(problems, self.unknowns, self.theta)
+        return _pushed(self.model, pushers, [p.motion for p in problems], residual, free)
 
 
 def _worst(by_torque: Sequence[str], missed: Mapping[str, float]) -> tuple[str, ...]:
@@ -264,11 +307,11 @@ def _beyond_friction(
 
 def _pushed(
     model: Model,
-    candidates: Sequence[tuple[str, str | None]],
+    candidates: Sequence[EffectAt],
     motions: Sequence[Motion],
     error: np.ndarray,
     free: Sequence[str],
-) -> tuple[tuple[str, str | None], ...]:
+) -> tuple[EffectAt, ...]:
     """The pushes that are worth a fit, if any.
 
     Most blocks of rows are without one. What stands out of them as much as it does elsewhere is an
@@ -308,7 +351,7 @@ def _pushed(
     return tuple(dict.fromkeys(nearest))
 
 
-def _about(model: Model, candidate: tuple[str, str | None], free: Sequence[str]) -> list[int]:
+def _about(model: Model, candidate: EffectAt, free: Sequence[str]) -> list[int]:
     """Of the coordinates of these names, those that a push acts about."""
     effect = LIBRARY[candidate[0]](model.mechanism, candidate[1])
     acting = {p.name for p in effect.parameters if p.neutral is not None}
@@ -337,7 +380,7 @@ def _late(name: str) -> bool:
 
 def _gain_by_fit(
     model: Model,
-    candidate: tuple[str, str | None],
+    candidate: EffectAt,
     promising: Sequence[int],
     train: Sequence[DataSet],
     bounds: Bounds,
