@@ -266,7 +266,7 @@ def test_no_rotor_is_sought_where_only_beliefs_speak(nominal):
     base = Task(nominal, base=found, first=found)
     effects = [('torque_bias', None), ('joint_flexibility', None), ('backlash', None)]
     halving = SuccessiveHalving(train, held, carry_out)
-    outcomes, aside = halving.run(base, effects, 'effects', by_belief=True)
+    outcomes, aside = halving.run_by_belief(base, effects, 'effects')
     assert {outcome.label for outcome in outcomes} == {'torque_bias'}
     assert set(asked) == {('torque_bias', None)}
     assert set(aside) == {'joint_flexibility', 'backlash'}

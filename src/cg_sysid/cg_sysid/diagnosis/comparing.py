@@ -39,17 +39,24 @@ def compare(
         if beaten is not None:
             error, task = beaten.train.normalised_error, replace(task, rival=rival_of(beaten))
         work.under_way = base
-        outcomes: list[Outcome] = []
-        aside: list[str] = []
-        if not done(work, base):
-            outcomes, aside = work.halving.run(
-                task, effects, title, error, work.selection.to_be_earned(base),
-                base.held.normalised_error, work.selection.only_beliefs(base),
-            )  # fmt: skip
+        outcomes, aside = in_competition(work, base, task, effects, title, error)
         comparison = less_shapes(work, work.selection.compare(base, outcomes))
         comparison = compared_with_free_shapes(work, comparison)
         work.comparisons[key] = replace(comparison, aside=tuple(aside))
     return work.comparisons[key]
+
+
+def in_competition(
+    work: Workspace, base: Outcome, task: Task, effects: Effects, title: str, beaten: float
+) -> tuple[list[Outcome], list[str]]:
+    """Fits of the effects to whole records, and labels of those that were not worth one."""
+    if done(work, base):
+        return [], []
+    if work.selection.only_beliefs(base):
+        return work.halving.run_by_belief(task, effects, title, beaten)
+    earned = work.selection.to_be_earned(base)
+    judged = base.held.normalised_error
+    return work.halving.run(task, effects, title, beaten, earned, judged)
 
 
 def less_shapes(work: Workspace, comparison: Comparison) -> Comparison:

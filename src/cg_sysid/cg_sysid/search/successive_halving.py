@@ -33,7 +33,7 @@ from cg_sysid.search.nuisance import nuisances
 from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.ranking import per_output
 from cg_sysid.search.starts import starts_of
-from cg_sysid.search.task import EffectAt, Task, effect_of, eventful
+from cg_sysid.search.task import EffectAt, Task, effect_of, eventful, label_of
 from cg_sysid.search.whole_fit import try_candidate
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,6 @@ class SuccessiveHalving:
         beaten: float = np.inf,
         earned: float = np.inf,
         judged: float = np.inf,
-        by_belief: bool = False,
     ) -> tuple[list[Outcome], list[str]]:
         """Fit every effect on top of a base.
 
@@ -133,8 +132,6 @@ class SuccessiveHalving:
             beaten: chi2/N that is to be beaten, or nearly so.
             earned: chi2/N that has to be come to (ModelSelection.to_be_earned).
             judged: chi2/N of the base on records held out.
-            by_belief: Whether nothing but numbers that nobody believes is at stake: then errors do
-                not tell candidates apart, and all that come near are fitted to whole records.
 
         Returns:
             Outcomes of fits to whole records, and labels of others that were not worth one.
@@ -142,52 +139,21 @@ class SuccessiveHalving:
         tasks = _on_top(base, effects)
         events = [task for task in tasks if eventful(task)]
         others = [task for task in tasks if not eventful(task)]
-        aside: list[str] = []
-        if by_belief:
-            # A rotor that moves by itself and leaves no error cannot be told from one that does
-            # not (Effect.without_states).
-            acting = [effect for task in others if (effect := effect_of(task)) is not None]
-            aside = [effect.label for effect in acting if effect.elastic]
-            others = [task for task, effect in zip(others, acting, strict=True)
-                      if not effect.elastic]  # fmt: skip
         looking = f'first look at {what}'
         screenings = self.screen(_light(others), looking)
         found: dict[str, Outcome] = {}
         if events and _nothing_helps(base, screenings) and self._happened(base, what):
             found, events = self._fitted(events, f'{what}, events'), []
-        # What is on top of a base has to come below it.
-        known = min(
-            settings.HALVING.near * min(_best(found), _smallest(screenings)),
-            settings.HALVING.as_good * beaten,
-        )
-        reach = min(known, worth_having(_clear(_smallest(screenings), base.first), base.first))
-        if by_belief:
-            reach = min(reach, _at_stake(base.first))
-        ahead = min(screenings, key=_known, default=None)
-        heavy = [replace(task, reach=reach) for task in others if _is_heavy(task)]
-        if base.rival is None and ahead and _leaves_little(ahead, base.first):
-            heavy = [replace(task, rival=rival_of(ahead)) for task in heavy]
-        waiting: list[Task] = []
-        if not by_belief:
-            heavy, waiting = self._spoken_for(heavy, base, f'what torques say of {what}')
+        heavy = _heavy(others, screenings, base, _to_come_to(screenings, base, beaten, found))
+        heavy, waiting = self._spoken_for(heavy, base, f'what torques say of {what}')
         screenings += self.screen(_longest_first(heavy), looking)
         tried: set[str] = set()
-        if by_belief:
-            limit = min(settings.HALVING.near * _smallest(screenings), _at_stake(base.first))
-            heat = [screening for screening in screenings if not screening.error > limit]
-            tried.update(screening.label for screening in heat)
-            most, reach = settings.HALVING.rungs[-1], _at_stake(base.base)
-            tasks = [replace(screening.task, iterations=most, reach=reach) for screening in heat]
-            return list(self._fitted(tasks, what).values()), [
-                *aside, *(s.label for s in screenings if s.label not in tried),
-            ]  # fmt: skip
         found = self._worth_a_fit(screenings, found, tried, base, beaten, earned, what)
         if waiting and np.isinf(_clear(_best(found), base.base)):
             # Who was spoken for explains little: it was none of these.
             screenings += self.screen(_longest_first(waiting), looking)
             found = self._worth_a_fit(screenings, found, tried, base, beaten, earned, what)
             waiting = []
-        aside += [effect.label for task in waiting if (effect := effect_of(task)) is not None]
         # To seek events in every record takes long: first what explains most of the error.
         # In records held out, too: something may have happened there and in no other.
         before = _error(base.base)
@@ -199,8 +165,34 @@ class SuccessiveHalving:
             found |= self._fitted(events, f'{what}, events')
         found |= self._in_more_depth(found, base.base, beaten, earned, what)
         return list(found.values()), [
-            *aside, *(s.label for s in screenings if s.label not in tried),
+            *map(label_of, waiting), *(s.label for s in screenings if s.label not in tried),
         ]  # fmt: skip
+
+    def run_by_belief(
+        self, base: Task, effects: Effects, what: str, beaten: float = np.inf
+    ) -> tuple[list[Outcome], list[str]]:
+        """The same where nothing but numbers that nobody believes is at stake.
+
+        Then errors do not tell candidates apart, and all that come near are fitted to whole
+        records. A rotor that moves by itself and leaves no error cannot be told from one that does
+        not (Effect.without_states), and no event is sought.
+        """
+        tasks = [task for task in _on_top(base, effects) if not eventful(task)]
+        elastic = [task for task in tasks if (e := effect_of(task)) is not None and e.elastic]
+        others = [task for task in tasks if task not in elastic]
+        looking = f'first look at {what}'
+        screenings = self.screen(_light(others), looking)
+        reach = min(_to_come_to(screenings, base, beaten, {}), _at_stake(base.first))
+        heavy = _heavy(others, screenings, base, reach)
+        screenings += self.screen(_longest_first(heavy), looking)
+        limit = min(settings.HALVING.near * _smallest(screenings), _at_stake(base.first))
+        heat = [screening for screening in screenings if not screening.error > limit]
+        most, reach = settings.HALVING.rungs[-1], _at_stake(base.base)
+        found = self._fitted(
+            [replace(look.task, iterations=most, reach=reach) for look in heat], what
+        )
+        left = [look.label for look in screenings if look not in heat]
+        return list(found.values()), [*map(label_of, elastic), *left]
 
     def _spoken_for(
         self, tasks: Sequence[Task], base: Task, what: str
@@ -379,6 +371,29 @@ def _light(tasks: Iterable[Task]) -> list[Task]:
 def _is_heavy(task: Task) -> bool:
     """Whether it waits for the light ones: what those come to shows how far it may go."""
     return _cost_of(task) >= settings.HALVING.heavy
+
+
+def _to_come_to(
+    screenings: Sequence[Screening], base: Task, beaten: float, found: Mapping[str, Outcome]
+) -> float:
+    """chi2/N that matters to looks at heavy ones: on top of a base they have to come below it."""
+    smallest = _smallest(screenings)
+    return min(
+        settings.HALVING.near * min(_best(found), smallest),
+        settings.HALVING.as_good * beaten,
+        worth_having(_clear(smallest, base.first), base.first),
+    )
+
+
+def _heavy(
+    tasks: Sequence[Task], screenings: Sequence[Screening], base: Task, reach: float
+) -> list[Task]:
+    """Those that take long, with what they have to come up to: a light one that leaves little."""
+    heavy = [replace(task, reach=reach) for task in tasks if _is_heavy(task)]
+    ahead = min(screenings, key=_known, default=None)
+    if base.rival is None and ahead and _leaves_little(ahead, base.first):
+        return [replace(task, rival=rival_of(ahead)) for task in heavy]
+    return heavy
 
 
 def _deviance(task: Task) -> float:
