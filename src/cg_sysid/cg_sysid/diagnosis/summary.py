@@ -45,67 +45,94 @@ def summary_of(
         late: What errors of timing make of an error that stays unexplained, as a sentence.
     """
     if verdict == Verdict.CONSISTENT:
-        text = 'The model explains the records down to the noise of the sensors'
-        if max(g.before / g.after for g in gains) > NO_GAIN:
-            text += (
-                ', with what sound robots have besides: small faults and laws of another shape, '
-                'which the findings list and model.yaml holds'
-            )
-        if prior_conflicts:
-            text += f', but with {", ".join(prior_conflicts)} far from what its file believes'
-        return f'{text}.'
+        return _consistent(gains, prior_conflicts)
     biggest = max(gains, key=lambda g: g.before / g.noise)
     if verdict == Verdict.UNEXPLAINED:
         known = ' '.join(seen.text for seen in (unmodelled, wandering) if seen)
-        whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
-        text = (
-            f'Something is missing that no effect {whose} explains: {biggest.channel} is '
-            f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
-            f'{biggest.noise:.2g}. {known or late or NOTHING}'
-        )
-        if causes:
-            text += (
-                f' No more than {100 * explained:.0f} % of the squared error on held-out records '
-                f'goes with {listed([described(c) for c in causes])}, which may only stand in '
-                'for what is missing.'
-            )
-        return f'{text} {late}' if known and late else text
-    named = ', '.join(described(c) for c in causes)
+        return _unexplained(causes, biggest, tried, explained, known, late)
     if verdict == Verdict.UNFINISHED:
-        text = (
-            f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
-            f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '
-            'found so far.'
+        return _unfinished(causes, biggest, explained)
+    text = _lacks(causes, biggest, prior_conflicts) + _what_need_not_be(causes) + _advice(causes)
+    if left:
+        text += f' An error above the noise remains in {", ".join(left)}.'
+        text += ''.join(f' {seen.text}' for seen in (unmodelled, wandering) if seen)
+    return text
+
+
+def _consistent(gains: Sequence[Gain], prior_conflicts: Sequence[str]) -> str:
+    text = 'The model explains the records down to the noise of the sensors'
+    if max(g.before / g.after for g in gains) > NO_GAIN:
+        text += (
+            ', with what sound robots have besides: small faults and laws of another shape, '
+            'which the findings list and model.yaml holds'
         )
-        return f'{text} {named} takes {100 * explained:.0f} % of it.' if causes else text
+    if prior_conflicts:
+        text += f', but with {", ".join(prior_conflicts)} far from what its file believes'
+    return f'{text}.'
+
+
+def _unexplained(
+    causes: Sequence[Cause],
+    biggest: Gain,
+    tried: Sequence[str] | None,
+    explained: float,
+    known: str,
+    late: str,
+) -> str:
+    whose = 'of the library' if tried is None else f'that was tried ({", ".join(tried)})'
+    text = (
+        f'Something is missing that no effect {whose} explains: {biggest.channel} is '
+        f'simulated with an error of {biggest.after:.3g} {biggest.unit}, its noise is '
+        f'{biggest.noise:.2g}. {known or late or NOTHING}'
+    )
+    if causes:
+        text += (
+            f' No more than {100 * explained:.0f} % of the squared error on held-out records '
+            f'goes with {listed([described(c) for c in causes])}, which may only stand in '
+            'for what is missing.'
+        )
+    return f'{text} {late}' if known and late else text
+
+
+def _unfinished(causes: Sequence[Cause], biggest: Gain, explained: float) -> str:
+    text = (
+        f'{biggest.channel} is simulated with an error of {biggest.after:.3g} '
+        f'{biggest.unit}, its noise is {biggest.noise:.2g}, and no cause of most of it was '
+        'found so far.'
+    )
+    named = ', '.join(described(c) for c in causes)
+    return f'{text} {named} takes {100 * explained:.0f} % of it.' if causes else text
+
+
+def _lacks(causes: Sequence[Cause], biggest: Gain, prior_conflicts: Sequence[str]) -> str:
+    """What is wrong, how sure that is, and how much better the model is with it."""
+    named = ', '.join(described(c) for c in causes)
     if biggest.before < NO_GAIN * biggest.after and prior_conflicts:
-        text = (
+        return (
             f'The simulation lacks {named}: without it the model follows the records only with '
             f'{", ".join(prior_conflicts)} far from what its file believes.'
         )
-    else:
-        text = (
-            f'The simulation lacks {named}, {_sureness(causes)}; with it the held-out error of '
-            f'{biggest.channel} falls from {biggest.before:.3g} to {biggest.after:.3g} '
-            f'{biggest.unit} (noise {biggest.noise:.2g}).'
-        )
-    text += _what_need_not_be(causes)
+    return (
+        f'The simulation lacks {named}, {_sureness(causes)}; with it the held-out error of '
+        f'{biggest.channel} falls from {biggest.before:.3g} to {biggest.after:.3g} '
+        f'{biggest.unit} (noise {biggest.noise:.2g}).'
+    )
+
+
+def _advice(causes: Sequence[Cause]) -> str:
+    """The experiment that would tell rivals apart, if there is one."""
     best = next((c.proposals[0] for c in causes if c.proposals), None)
-    if best is not None and best.evidence > settings.SELECTION.margin:
-        text += (
-            f' To tell {" from ".join(best.weakest)}, run {best.experiment} '
-            f'(about {best.evidence:.0f} nats expected).'
+    if best is None:
+        return ''
+    weakest = ' from '.join(best.weakest)
+    if best.evidence > settings.SELECTION.margin:
+        return (
+            f' To tell {weakest}, run {best.experiment} (about {best.evidence:.0f} nats expected).'
         )
-    elif best is not None:
-        text += (
-            f' No experiment that can be launched would tell {" from ".join(best.weakest)}: for '
-            'what these recordings show they are one.'
-        )
-    if left:
-        text += f' An error above the noise remains in {", ".join(left)}.'
-        text += f' {unmodelled.text}' if unmodelled else ''
-        text += f' {wandering.text}' if wandering else ''
-    return text
+    return (
+        f' No experiment that can be launched would tell {weakest}: for '
+        'what these recordings show they are one.'
+    )
 
 
 def _what_need_not_be(causes: Sequence[Cause]) -> str:
