@@ -169,27 +169,36 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     paced = np.flatnonzero(np.diff(topic.log_ns) > WAITED * np.diff(topic.stamp_ns))
     if len(paced) < 4 * FLOOR:
         return
+    found = (
+        _rate_of_arrivals(topic, paced, origin)
+        or _lost_behind(raw, topic, origin)
+        or _clock_jump(topic, paced, origin)
+    )
+    if found is not None:
+        yield found
+
+
+def _rate_of_arrivals(topic: RawTopic, paced: np.ndarray, origin: int) -> Finding | None:
+    """Messages that come at another rate from some instant on, by arrivals and not by stamps."""
     stamp, log = topic.stamp_ns[paced], topic.log_ns[paced]
     change = _change_of_rate(np.diff(log) / NS_PER_S)
     if (
-        change is not None
-        and _change_of_rate(np.diff(stamp) / NS_PER_S) is None
-        and _falls_behind(stamp, log, *change)
+        change is None
+        or _change_of_rate(np.diff(stamp) / NS_PER_S) is not None
+        or not _falls_behind(stamp, log, *change)
     ):
-        k, before, after = change
-        yield Finding(
-            'sampling_rate_change',
-            'error',
-            topic.name,
-            f'messages arrive at {before:.4g} Hz, later at {after:.4g} Hz, but the stamps go on '
-            'as before: they are wrong',
-            _seconds(stamp[k], origin),
-            _seconds(stamp[-1], origin),
-            int(paced[k]),
-            after,
-            before,
-        )
-        return
+        return None
+    k, before, after = change
+    return Finding(
+        'sampling_rate_change', 'error', topic.name,
+        f'messages arrive at {before:.4g} Hz, later at {after:.4g} Hz, but the stamps go on '
+        'as before: they are wrong',
+        _seconds(stamp[k], origin), _seconds(stamp[-1], origin), int(paced[k]), after, before,
+    )  # fmt: skip
+
+
+def _lost_behind(raw: RawRecording, topic: RawTopic, origin: int) -> Finding | None:
+    """Samples that did not arrive, while the stamps go on as if none were missing."""
     known = raw.mechanism
     ends = [
         raw.topics[t.name].stamp_ns[-1]
@@ -197,30 +206,29 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
         if t.name != topic.name and len(raw.topics.get(t.name, ()))
     ]
     holes, lost = lost_behind_stamps(topic, float(np.median(ends)) if ends else np.inf)
-    if holes:
-        k = holes[0]
-        yield Finding(
-            'dropped_samples',
-            'error',
-            topic.name,
-            f'about {lost} sample(s) lost, the first '
-            'here, while the stamps go on as if none were: they are wrong',
-            _seconds(topic.stamp_ns[k - 1], origin),
-            _seconds(topic.stamp_ns[holes[-1]], origin),
-            k,
-            lost,
-            0,
-        )
-        return
+    if not holes:
+        return None
+    k = holes[0]
+    return Finding(
+        'dropped_samples', 'error', topic.name,
+        f'about {lost} sample(s) lost, the first here, while the stamps go on as if none were: '
+        'they are wrong',
+        _seconds(topic.stamp_ns[k - 1], origin), _seconds(topic.stamp_ns[holes[-1]], origin),
+        k, lost, 0,
+    )  # fmt: skip
+
+
+def _clock_jump(topic: RawTopic, paced: np.ndarray, origin: int) -> Finding | None:
+    """A clock that jumps moves the floor of the offset, to which late arrivals only add."""
+    stamp, log = topic.stamp_ns[paced], topic.log_ns[paced]
     offset = (log - stamp).astype(float) / NS_PER_S
-    # Late arrivals come and go and only add to the offset; a clock that jumps moves its floor.
     windows = np.lib.stride_tricks.sliding_window_view(offset, FLOOR).min(axis=1)
     moved = windows[FLOOR:] - windows[:-FLOOR]  # sample k = index + FLOOR
     k = int(np.argmax(np.abs(moved))) + FLOOR
     before, after = np.median(windows[: max(1, k - FLOOR)]), np.median(windows[k:])
     lasting = float(after - before)
     if abs(moved[k - FLOOR]) < CLOCK_JUMP_S or abs(lasting) < 0.5 * CLOCK_JUMP_S:
-        return
+        return None
     jumps = np.abs(np.diff(offset))
     near = slice(max(0, k - FLOOR), min(len(jumps), k + FLOOR))
     k = near.start + int(np.argmax(jumps[near])) + 1
@@ -229,26 +237,16 @@ def _arrivals(raw: RawRecording, topic: RawTopic, origin: int) -> Iterator[Findi
     place = (_seconds(stamp[k - 1], origin), _seconds(stamp[k], origin), int(paced[k]))
     size = f'{1e3 * abs(lasting):.0f} ms'
     if in_stamp > in_log:
-        yield Finding(
-            'clock_jump',
-            'error',
-            topic.name,
+        return Finding(
+            'clock_jump', 'error', topic.name,
             f"the stamps jump by {size} against the recorder's clock",
-            *place,
-            lasting,
-            CLOCK_JUMP_S,
-        )
-    else:
-        yield Finding(
-            'clock_jump',
-            'warning',
-            topic.name,
-            f"the recorder's clock jumps by {size} against the stamps",
-            *place,
-            lasting,
-            CLOCK_JUMP_S,
-            'the stamps count, not the times of arrival',
-        )
+            *place, lasting, CLOCK_JUMP_S,
+        )  # fmt: skip
+    return Finding(
+        'clock_jump', 'warning', topic.name,
+        f"the recorder's clock jumps by {size} against the stamps",
+        *place, lasting, CLOCK_JUMP_S, 'the stamps count, not the times of arrival',
+    )  # fmt: skip
 
 
 def _falls_behind(stamp: np.ndarray, log: np.ndarray, k: int, before: float, after: float) -> bool:
