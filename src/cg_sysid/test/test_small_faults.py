@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import hanging_arm
 import pytest
+from searches import search_for
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
@@ -336,6 +337,28 @@ def test_a_fit_with_small_faults_that_goes_astray_goes_on_from_the_one_without(
     monkeypatch.setattr(whole_fit, '_own_fit', astray)
     found = small_faults.with_small_faults(work, plain)
     assert at_noise(found)
+
+
+@pytest.mark.parametrize(('times', 'asked'), [(20.0, False), (10.0, True)])
+def test_no_fit_without_a_small_fault_is_asked_where_that_is_clear(
+    nominal, monkeypatch, times, asked
+):
+    work = search_for(nominal, nominal)
+    model = nominal.with_effect('actuator_delay').with_effect('imu_offset')
+    bounds = {'actuator_delay.delay': 1.2e-3, 'imu_offset.offset': 2e-3}
+    final = try_candidate(Task(model, bounds=bounds), work.train, work.held)
+    sizes = {'actuator_delay': {'delay': (times * 1e-5, 1e-5, 's')},
+             'imu_offset': {'offset': (1e-4, 1e-4, 'rad')}}  # fmt: skip
+    monkeypatch.setattr(small_faults, 'parameters_of', lambda o, label: sizes[label])
+    taken = []
+
+    def without(work, o, gone, reach):
+        taken.append(gone)
+
+    monkeypatch.setattr(small_faults, 'without_small_faults', without)
+    assert small_faults.less_small_faults(work, final) is final
+    both, idle = ['actuator_delay', 'imu_offset'], ['imu_offset']
+    assert taken == ([both, idle] if asked else [idle])
 
 
 def test_small_faults_stay_within_their_bounds(nominal):

@@ -198,10 +198,11 @@ def of_size(work: Workspace, comparison: Comparison) -> Comparison:
 
 def less_small_faults(work: Workspace, final: Outcome) -> Outcome:
     """Without those small faults that, beside the causes, explain nothing any more."""
-    small = nuisances(final.model, final.task.bounds)
-    idle = [label for label in sorted(small) if not shows(final, label)]
+    small = sorted(nuisances(final.model, final.task.bounds))
+    idle = [label for label in small if not shows(final, label)]
+    clear = any(shows(final, label, settings.DOUBT.clear) for label in small)
     reach = settings.HALVING.as_good * final.train.normalised_error
-    for gone in (sorted(small), idle):
+    for gone in ([] if clear else small, idle):
         if not gone:
             continue
         lean = without_small_faults(work, final, gone, reach)
@@ -252,10 +253,10 @@ def shown(o: Outcome) -> tuple[str, ...]:
     return tuple(label for label in small if shows(o, label))
 
 
-def shows(o: Outcome, label: str) -> bool:
-    """True if a small fault is larger than its uncertainty."""
+def shows(o: Outcome, label: str, times: float = settings.DOUBT.shows) -> bool:
+    """True if a small fault is so many times larger than its uncertainty."""
     value, sigma, _ = next(iter(parameters_of(o, label).values()))
-    return abs(value) > settings.DOUBT.shows * sigma
+    return abs(value) > times * sigma
 
 
 def small_faults_of(o: Outcome) -> list[str]:

@@ -221,6 +221,8 @@ class Doubt:
         reviews: Passes of doubt over what was accepted.
         most_of_it: Share of the error that may be left for small faults to be taken up.
         shows: Standard deviations from which a small fault is there at all.
+        clear: From which no fit without it need be asked: 112 nats, where `selection.earned` would
+            do.
         level: Squared standard deviations within which two fits say the same of all data.
         from_afar: Times the best start's error, from which a start leads nowhere else at the
             noise.
@@ -238,6 +240,7 @@ class Doubt:
     reviews: int = 4
     most_of_it: float = 0.7
     shows: float = 3.0
+    clear: float = 15.0
     level: float = 1.0
     from_afar: float = 2.0
     proposed: int = 3
