@@ -14,7 +14,7 @@ parameters far outside what the model file believes.
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -130,51 +130,118 @@ def fit(
     problem = Problem(
         model, data_sets, unknowns, _guesses(model, data_sets, own or {}), refinement, company
     )
-    by_torque = start is None and torque_error.can(model)
-    if by_torque and at is None and unknowns:
-        found = torque_error.fit_by_torque(model, data_sets, only, bounds)
-        at = found.values if found else None
-    values = [(at or {}).get(u.name, u.prior) for u in unknowns] if start is None else start.values
-    theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
-    motions = list(problem.guesses if start is None else start.motions)
+    first = _start_of(problem, only, bounds, start, at)
     longest = min(max(data_set.duration for data_set in data_sets), horizon)
-    weight = 1.0 if start is None else 1 / start.inflation
     place = kept_fits.place_of(
-        model, data_sets, names=[u.name for u in unknowns], theta=theta, motions=motions,
-        guesses=problem.guesses, longest=longest, weight=weight, reweight=reweight,
-        behind=start.horizon if start else 0.0, bounds=bounds or {}, iterations=iterations,
+        model, data_sets, names=[u.name for u in unknowns], theta=first.theta,
+        motions=first.motions, guesses=problem.guesses, longest=longest, weight=first.weight,
+        reweight=reweight, behind=first.behind, bounds=bounds or {}, iterations=iterations,
         thorough=thorough, refinement=refinement, reach=reach,
     )  # fmt: skip
     end, trial = kept_fits.recall(place), None
     if end is None:
-        behind = start.horizon if start else 0.0
-        stages = [h for h in HORIZONS if behind < h and _share(data_sets, h, longest) < MOST]
-        if by_torque:
-            trial = attempt(problem, theta, motions, longest)
-            if _resembles(trial, weight):
-                stages = []  # the torques have led the way
-            elif stages:
-                trial = attempt(problem, theta, motions, stages[0])
-            theta, motions, trial = _around(
-                problem, theta, motions, stages[0] if stages else longest, weight,
-                min(SETTLING, 2 * iterations), reach, trial,
-            )  # fmt: skip
-        end, trial = _descend(
-            problem, theta, motions, [*stages, longest], weight, iterations, reweight, thorough,
-            reach, progress, None if stages else trial,
-        )  # fmt: skip
+        end, trial = _searched(
+            problem, first, longest, iterations, reweight, thorough, reach, progress
+        )
         kept_fits.keep(place, end)
-    values = problem.values(end.theta)
     if sure:
         trial = trial or attempt(problem, end.theta, end.motions, longest)
-        covariance, information, sigmas = uncertainty(problem, trial, end.weight)
+        how_sure = uncertainty(problem, trial, end.weight)
     else:
-        covariance, information, sigmas = not_asked(problem)
+        how_sure = not_asked(problem)
+    found = replace(_told(problem, end, longest, *how_sure), seconds=clock.perf_counter() - began)
+    return replace(found, warnings=tuple(warnings_of(found, bounds or ()))) if sure else found
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where a search sets out.
+
+    Attributes:
+        theta: Coordinates of the unknowns, shape (k,).
+        motions: What each data set has of its own.
+        weight: Of the residual.
+        behind: Horizon over which this has been fitted already, s.
+        by_torque: Whether torques say where.
+    """
+
+    theta: np.ndarray
+    motions: list[np.ndarray]
+    weight: float
+    behind: float
+    by_torque: bool
+
+
+def _start_of(
+    problem: Problem,
+    only: Sequence[str] | None,
+    bounds: Mapping[str, float] | None,
+    start: Fit | None,
+    at: Mapping[str, float] | None,
+) -> _Start:
+    model, unknowns = problem.model, problem.unknowns
+    if start is not None:
+        values, motions = start.values, list(start.motions)
+        weight, behind, by_torque = 1 / start.inflation, start.horizon, False
+    else:
+        by_torque, behind, weight = torque_error.can(model), 0.0, 1.0
+        if by_torque and at is None and unknowns:
+            found = torque_error.fit_by_torque(model, problem.data_sets, only, bounds)
+            at = found.values if found else None
+        values = np.array([(at or {}).get(u.name, u.prior) for u in unknowns])
+        motions = list(problem.guesses)
+    theta = np.array([u.to_coordinate(v) for u, v in zip(unknowns, values, strict=True)])
+    return _Start(theta, motions, weight, behind, by_torque)
+
+
+def _searched(
+    problem: Problem,
+    first: _Start,
+    longest: float,
+    iterations: int,
+    reweight: bool,
+    thorough: bool,
+    reach: float,
+    progress: Progress,
+) -> tuple[End, Trial | None]:
+    """From a start to the minimum; returned as of `_descend`."""
+    theta, motions, trial = first.theta, first.motions, None
+    stages = [h for h in HORIZONS
+              if first.behind < h and _share(problem.data_sets, h, longest) < MOST]  # fmt: skip
+    if first.by_torque:
+        trial = attempt(problem, theta, motions, longest)
+        if _resembles(trial, first.weight):
+            stages = []  # the torques have led the way
+        elif stages:
+            trial = attempt(problem, theta, motions, stages[0])
+        theta, motions, trial = _around(
+            problem, theta, motions, stages[0] if stages else longest, first.weight,
+            min(SETTLING, 2 * iterations), reach, trial,
+        )  # fmt: skip
+    return _descend(
+        problem, theta, motions, [*stages, longest], first.weight, iterations, reweight, thorough,
+        reach, progress, None if stages else trial,
+    )  # fmt: skip
+
+
+def _told(
+    problem: Problem,
+    end: End,
+    longest: float,
+    covariance: np.ndarray,
+    information: np.ndarray,
+    sigmas: Sequence[np.ndarray],
+) -> Fit:
+    """What was found, in values."""
+    model, unknowns = problem.model, problem.unknowns
+    values, covariance = as_waves_are_written(
+        model, unknowns, problem.values(end.theta), covariance
+    )
     unsettled = len(unsettled_states(model))
-    values, covariance = as_waves_are_written(model, unknowns, values, covariance)
-    fitted = with_uncertainty(model, unknowns, values, covariance)
-    result = Fit(
-        model=fitted,
+    away = [motion[len(t.motion) :][:unsettled]
+            for t, motion in zip(problem.data_sets, end.motions, strict=True)]  # fmt: skip
+    return Fit(
+        model=with_uncertainty(model, unknowns, values, covariance),
         unknowns=unknowns,
         values=values,
         covariance=covariance,
@@ -182,21 +249,17 @@ def fit(
         motions=tuple(end.motions),
         own=problem.own,
         own_sigmas=tuple(s[unsettled:] for s in sigmas),
-        starts=_demanded(
-            [m[len(t.motion) :][:unsettled] for t, m in zip(data_sets, end.motions, strict=True)],
-            [s[:unsettled] for s in sigmas],
-        ),
+        starts=_demanded(away, [s[:unsettled] for s in sigmas]),
         cost=end.cost,
         mse=end.sse / np.maximum(end.count, 1),
         count=end.count,
         inflation=1 / end.weight,
         horizon=longest,
         evaluations=problem.evaluations,
-        seconds=clock.perf_counter() - began,
-        refinement=refinement,
+        seconds=0.0,
+        refinement=problem.refinement,
         converged=end.converged,
     )
-    return replace(result, warnings=tuple(warnings_of(result, bounds or ()))) if sure else result
 
 
 def _resembles(trial: Trial | None, weight: float) -> bool:
