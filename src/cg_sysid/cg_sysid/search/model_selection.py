@@ -165,56 +165,20 @@ class ModelSelection:
         significance = block_gain(base.residuals[n:], o.residuals[n:], self.rows_per_block)
         explained = explained_by(base, o)
         held_gain = 1 - o.held.normalised_error / base.held.normalised_error
+        own = own_parameters(o)
         reasons = []
         if gained < settings.SELECTION.earned:
             reasons.append(f'evidence {gained:.1f} nats, {settings.SELECTION.earned:g} needed')
-        imitated = self.imitated(base)
-        if self._beliefs_decide(base):
-            # No error is left to explain, but numbers that nobody believes.
-            if prior_conflicts(o) or not (at_noise(o) or self._as_good(base, o)):
-                reasons.append('leaves numbers far from what the model file believes')
-        elif significance < settings.SELECTION.significant or held_gain <= 0:
-            reasons.append('no significant gain on held-out records')
-        elif (
-            explained < settings.SELECTION.material
-            and not (prior_conflicts(base) and not prior_conflicts(o))
-            and not (imitated and self._white(o))
-        ):
-            reasons.append(
-                f'explains {explained:.2f} noise standard deviations, '
-                f'{settings.SELECTION.material:g} needed'
-            )
-        each = _own_values(o) / len(self.steps)
-        eventful = any(u.each == 'record' for u in o.train.own)
-        if eventful and independent < settings.SELECTION.says_more * each * len(self.steps):
-            # With a push of its own a short record is matched whatever is wrong, held out or not.
-            reasons.append(
-                f'records of {independent / len(self.steps):.0f} independent samples cannot '
-                f"judge {each:.0f} values of each record's own"
-            )
-        left = above_noise(o) / max(above_noise(base), 1e-300)
-        if eventful and not at_noise(o) and left > settings.SELECTION.mishap:
-            # A push in every record takes the edge off whatever is wrong all the time.
-            reasons.append(
-                f'leaves {100 * left:.0f} % of the error, at most '
-                f'{100 * settings.SELECTION.mishap:.0f} % allowed'
-            )
-        elif self._is_remainder(base) and not at_noise(o) and left > settings.SELECTION.mishap:
-            # A law that is drawn otherwise leaves a little, and much takes the edge off that.
-            share = 100 * float(np.sqrt(above_noise(base) / self.before_causes))
-            reasons.append(
-                f'leaves {100 * left:.0f} % of an error that is {share:.1g} % of what the causes '
-                'before it explain: their laws may be so far off'
-            )
-        if eventful and explained < settings.EVENTS.little:
+        reasons += self._gains_nothing(base, o, significance, held_gain, explained)
+        reasons += self._takes_the_edge_off(base, o, independent)
+        if any(u.each == 'record' for u in o.train.own) and explained < settings.EVENTS.little:
             reasons += within_friction(o)
         reasons += never_happens(o)
-        own = own_parameters(o)
         # What sound robots have lies at the edge of what is a cause.
-        sound = as_sound_robots(o.label, own)
-        reasons += sound or at_edge(o)
+        reasons += as_sound_robots(o.label, own) or at_edge(o)
         # What takes most of the error acts, though its numbers may be known together only.
-        if at_noise(base) or left > 1 - settings.SELECTION.accounts or not _known_at_all(o):
+        most = _left(base, o) <= 1 - settings.SELECTION.accounts
+        if at_noise(base) or not most or not _known_at_all(o):
             reasons += too_small(o) + undetermined_size(o)
         reasons += self._implausible(o)
         return Candidate(
@@ -229,6 +193,55 @@ class ModelSelection:
             parameters=own,
             reason='; '.join(reasons),
         )
+
+    def _gains_nothing(
+        self, base: Outcome, o: Outcome, significance: float, held_gain: float, explained: float
+    ) -> list[str]:
+        """That records held out do not show it, or too little."""
+        if self._beliefs_decide(base):
+            # No error is left to explain, but numbers that nobody believes.
+            if prior_conflicts(o) or not (at_noise(o) or self._as_good(base, o)):
+                return ['leaves numbers far from what the model file believes']
+            return []
+        if significance < settings.SELECTION.significant or held_gain <= 0:
+            return ['no significant gain on held-out records']
+        relieves = prior_conflicts(base) and not prior_conflicts(o)
+        whitens = self.imitated(base) and self._white(o)
+        if explained < settings.SELECTION.material and not relieves and not whitens:
+            return [
+                f'explains {explained:.2f} noise standard deviations, '
+                f'{settings.SELECTION.material:g} needed'
+            ]
+        return []
+
+    def _takes_the_edge_off(self, base: Outcome, o: Outcome, independent: float) -> list[str]:
+        """That it can take a part of whatever is wrong, as what every record has of its own."""
+        reasons = []
+        left = _left(base, o)
+        each = _own_values(o) / len(self.steps)
+        eventful = any(u.each == 'record' for u in o.train.own)
+        if eventful and independent < settings.SELECTION.says_more * each * len(self.steps):
+            # With a push of its own a short record is matched whatever is wrong, held out or not.
+            reasons.append(
+                f'records of {independent / len(self.steps):.0f} independent samples cannot '
+                f"judge {each:.0f} values of each record's own"
+            )
+        if at_noise(o) or left <= settings.SELECTION.mishap:
+            return reasons
+        if eventful:
+            # A push in every record takes the edge off whatever is wrong all the time.
+            reasons.append(
+                f'leaves {100 * left:.0f} % of the error, at most '
+                f'{100 * settings.SELECTION.mishap:.0f} % allowed'
+            )
+        elif self._is_remainder(base):
+            # A law that is drawn otherwise leaves a little, and much takes the edge off that.
+            share = 100 * float(np.sqrt(above_noise(base) / self.before_causes))
+            reasons.append(
+                f'leaves {100 * left:.0f} % of an error that is {share:.1g} % of what the causes '
+                'before it explain: their laws may be so far off'
+            )
+        return reasons
 
     def _implausible(self, o: Outcome) -> list[str]:
         """That an effect's values are none of what it is named after."""
@@ -307,6 +320,11 @@ def _immaterial(o: Outcome) -> bool:
     return bool(
         per_output(o.held).max() < settings.NOISE.quietest + settings.SELECTION.material**2
     )
+
+
+def _left(base: Outcome, o: Outcome) -> float:
+    """Share of the squared error above the noise that an effect leaves."""
+    return above_noise(o) / max(above_noise(base), 1e-300)
 
 
 def explained_by(base: Outcome, o: Outcome) -> float:
