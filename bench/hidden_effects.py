@@ -39,12 +39,12 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.diagnose import diagnose, led_in, split
+from cg_sysid.diagnosis.diagnose import diagnose, split
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.catalogue import load_experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.data_set import led_in, prepare
 from cg_sysid.identification.identify import fit, score
 from cg_sysid.identification.unknowns import own_unknowns
 from cg_sysid.search.nuisance import with_nuisances

@@ -32,8 +32,8 @@ from peers import Answer, Case, NameCause
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.diagnose import LEAD_IN_S, diagnose, split
-from cg_sysid.identification.data_set import prepare
+from cg_sysid.diagnosis.diagnose import diagnose, split
+from cg_sysid.identification.data_set import LEAD_IN_S, prepare
 from cg_sysid.search.ranking import effect_name
 
 EFFECTS = (

@@ -53,6 +53,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid import parallel
 from cg_sysid.checks.loading import load_bags
 from cg_sysid.cli.new_robot import template
@@ -61,7 +62,7 @@ from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.records.bag_file import BagWriter
 from cg_sysid.records.bags import read_bag
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 
 SOUND = 4  # machines of each robot with nothing hidden
 PAUSE = 2.0  # s between two recordings

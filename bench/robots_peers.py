@@ -48,8 +48,8 @@ from robots_machines import ROBOTS, Robot
 from cg_dynamics.mechanisms.mechanism import Mechanism
 from cg_dynamics.model import Model
 from cg_sysid.checks.loading import load_bags
-from cg_sysid.diagnosis.diagnose import led_in, split
-from cg_sysid.identification.data_set import DataSet, pieces, prepare
+from cg_sysid.diagnosis.diagnose import split
+from cg_sysid.identification.data_set import DataSet, led_in, pieces, prepare
 
 logging.set_verbosity(logging.ERROR)  # our readings are computed from the state
 

@@ -23,9 +23,9 @@ from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.diagnose import led_in, split
+from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.errors import Failure
-from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.data_set import led_in, prepare
 from cg_sysid.parallel import run_all
 from cg_sysid.search import settings
 from cg_sysid.search.nuisance import with_nuisances

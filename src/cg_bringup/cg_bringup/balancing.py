@@ -19,8 +19,9 @@ from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimator
 from cg_hardware.safety import GateSettings, TorqueGate
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.records.raw import NOTE_FORMAT
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 
 FALLEN = 0.6  # rad of the stance leg: nothing catches the robot from there
 

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from cg_bringup.balancing import FALLEN
 from cg_bringup.runs import NodeOf
 from cg_bringup.supervisor import ProcessDied, supervised
 from cg_dynamics.stop_request import Stopped
@@ -35,7 +36,6 @@ NEXT = (
     'still; or /drive/home, /drive/index_by_hand), /safety_gate/arm, /drive/enable. '
     '/safety_gate/stop is the emergency stop'
 )
-FALLEN = 0.6  # rad of the stance leg
 FREE = 'free'
 
 

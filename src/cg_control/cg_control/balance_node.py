@@ -25,7 +25,7 @@ from sensor_msgs.msg import JointState
 from cg_control.answer_age import AnswerAges
 from cg_control.balancing.balance import BALANCING, WEIGHTS, BalanceSettings
 from cg_control.balancing.live_design import LiveDesign
-from cg_control.state_message import state_of
+from cg_control.state_message import GAP_S, state_of
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
 from cg_interfaces import topics
@@ -40,7 +40,6 @@ from cg_interfaces.ros import (
 from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
-GAP = 0.02  # s between states after which the one before is history
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class BalanceNode(Node):
         if stamp_ns == self._last_ns:
             self.publisher.publish(self.message)
             return
-        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
+        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP_S * 1e9:
             self.controller.stop()
         self._last_ns = stamp_ns
         if self.controller.settings is not self.declared.values:

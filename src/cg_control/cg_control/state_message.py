@@ -7,6 +7,7 @@ import numpy as np
 from cg_dynamics.rig import STANCES
 
 ROTOR = 'hip_rotor'
+GAP_S = 0.02  # between states, after which the one before is history
 
 
 def state_of(message: Any) -> tuple[str, np.ndarray]:

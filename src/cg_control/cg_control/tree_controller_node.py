@@ -28,7 +28,7 @@ from std_msgs.msg import Int32, String
 from cg_control.answer_age import AnswerAges, percentiles
 from cg_control.balancing.balance import BALANCING, WEIGHTS
 from cg_control.balancing.live_design import LiveDesign
-from cg_control.state_message import state_of
+from cg_control.state_message import GAP_S, state_of
 from cg_control.trees.recovery import FOLLOWING, KEPT, RecoverySettings, TreeController
 from cg_control.trees.tree_files import TreeSelection
 from cg_control.trees.tree_loader import TreeLoader
@@ -47,7 +47,6 @@ from cg_interfaces.ros import (
 from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
-GAP = 0.02  # s between states after which the one before is history
 SHOWN = 0.05  # s between words about where the reference is, for people to look at
 
 
@@ -171,7 +170,7 @@ class TreeControllerNode(Node):
         self._collect()
         if self._last_ns is None and self.declared.values.await_tree and not self.controller.tree:
             return
-        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
+        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP_S * 1e9:
             self.controller.interrupt()
         self._last_ns = stamp_ns
         self._let_demand_lapse(stamp_ns)

@@ -30,7 +30,7 @@ from cg_control.following.execution import (
     ExecutionSettings,
     TrajectoryController,
 )
-from cg_control.state_message import state_of
+from cg_control.state_message import GAP_S, state_of
 from cg_control.trajectories.trajectory import Trajectory, TrajectoryError
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
@@ -47,7 +47,6 @@ from cg_interfaces.ros import (
 from cg_interfaces.settings import setting
 
 NOMINAL_MODEL = 'compass_gait_mit'
-GAP = 0.02  # s between states after which the one before is history
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ class TvlqrNode(Node):
         waiting = self.declared.values.await_trajectory and self.trajectory is None
         if waiting and self._last_ns is None:
             return
-        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP * 1e9:
+        if self._last_ns is not None and not 0 < stamp_ns - self._last_ns < GAP_S * 1e9:
             self.controller.interrupt()
         self._last_ns = stamp_ns
         if self.controller.settings is not self.declared.values:

@@ -32,8 +32,8 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 from cg_dynamics.rollout.compiled import compile_model
 from cg_dynamics.walking.impact import impact
+from cg_interfaces.stamps import NS_PER_S
 
-NANOSECONDS = 1_000_000_000
 RUNAWAY = 1e3  # rad, rad/s: no estimate of this robot is there
 ANGLES = ('imu_angle', 'hip_angle')
 FASTEST = 20.0  # rad/s: no angle of this robot changes faster
@@ -145,7 +145,7 @@ class StampedEstimator(ABC):
         torque = torque if math.isfinite(torque) else 0.0
         stance = stance or self.stance
         last = self._estimate
-        gap = 0.0 if last is None else (stamp_ns - last.stamp_ns) / NANOSECONDS
+        gap = 0.0 if last is None else (stamp_ns - last.stamp_ns) / NS_PER_S
         if last is None or abs(gap) > self.longest_gap:
             return self._start(stamp_ns, torque, y, stance)
         if gap <= 0.0:
@@ -163,7 +163,7 @@ class StampedEstimator(ABC):
 
     def _believes(self, stamp_ns: int, y: np.ndarray) -> bool:
         """Leave out angles that jump; False if one has a new zero, or was away for too long."""
-        now = (stamp_ns - self._start_ns) / NANOSECONDS
+        now = (stamp_ns - self._start_ns) / NS_PER_S
         for k, channel in enumerate(self.channels):
             if channel not in ANGLES or math.isnan(y[k]):
                 continue
@@ -199,7 +199,7 @@ class StampedEstimator(ABC):
         return self._conclude(stamp_ns, y, 0.0)
 
     def _conclude(self, stamp_ns: int, y: np.ndarray, running: float) -> Estimate:
-        now = (stamp_ns - self._start_ns) / NANOSECONDS
+        now = (stamp_ns - self._start_ns) / NS_PER_S
         for channel, value in zip(self.channels, y, strict=True):
             if not math.isnan(value):
                 self._seen[channel] = now

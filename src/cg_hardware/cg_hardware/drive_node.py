@@ -59,8 +59,8 @@ from cg_interfaces.ros import (
     run,
     to_nanoseconds,
 )
+from cg_interfaces.stamps import NS_PER_S
 
-NANOSECONDS = 1_000_000_000
 RETRY = 1.0  # s between attempts to find the drive
 WORDLESS = 1.0  # s that a drive may say nothing before it is looked for anew
 WITHIN = 0.0012  # s after a SYNC in which the drive answers, as a rule
@@ -156,7 +156,7 @@ class DriveNode(Node):
             self._answers += 1
             self._counts, self._heard_at = answer.counts, now
             self.out.answer(answer, self._zero_counts())
-        return max(0.0, (self._next_ns - time.monotonic_ns()) / NANOSECONDS)
+        return max(0.0, (self._next_ns - time.monotonic_ns()) / NS_PER_S)
 
     def _zero_counts(self) -> int | None:
         """Where the hip's angle is zero; None while the drive's counts may begin anew."""

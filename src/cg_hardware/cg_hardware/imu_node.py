@@ -40,7 +40,6 @@ from cg_interfaces.ros import (
 )
 from cg_interfaces.settings import Settings, setting
 
-NANOSECONDS = 1_000_000_000
 PATIENCE = 0.002  # s that a read waits for the first byte
 RETRY = 0.5  # s between attempts to open the line
 SILENCE = 0.1  # s without a sample after which the line counts as dead

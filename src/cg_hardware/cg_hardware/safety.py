@@ -21,8 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cg_interfaces.settings import Settings, setting
-
-NANOSECONDS = 1_000_000_000
+from cg_interfaces.stamps import NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class GateSettings(Settings):
     @property
     def sample_ns(self) -> int:
         """Time between two measurements in ns."""
-        return round(NANOSECONDS / self.sample_rate_hz)
+        return round(NS_PER_S / self.sample_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ class TorqueGate:
         if ahead > self.settings.sample_ns:
             return Judgement(
                 self._held.torque,
-                f'dated {ahead / NANOSECONDS:.3g} s ahead of the last measurement; refused',
+                f'dated {ahead / NS_PER_S:.3g} s ahead of the last measurement; refused',
                 refused=True,
             )
         if self._in_force(now_ns) and self._held_ns is not None and stamp_ns < self._held_ns:
@@ -177,7 +176,7 @@ class TorqueGate:
             self.drop(self.rivalry)
             judgement = self._held
         elif self._held_ns is not None and not self._in_force(now_ns):
-            age = (now_ns - self._since_ns) / NANOSECONDS
+            age = (now_ns - self._since_ns) / NS_PER_S
             kind = 'old' if age > 0.0 else 'ahead of the clock'
             judgement = Judgement(self._zero, f'command is {abs(age):.3g} s {kind}')
         torque = self._slowed(judgement.torque, now_ns)
@@ -186,12 +185,12 @@ class TorqueGate:
 
     def _in_force(self, now_ns: int) -> bool:
         age = now_ns - self._since_ns
-        return self._held_ns is not None and 0 <= age <= self.settings.stale_after * NANOSECONDS
+        return self._held_ns is not None and 0 <= age <= self.settings.stale_after * NS_PER_S
 
     def _slowed(self, wanted: tuple[float, ...], now_ns: int) -> tuple[float, ...]:
         if self.settings.rate_limit == 0.0:
             return wanted
-        elapsed = 0.0 if self._output_ns is None else (now_ns - self._output_ns) / NANOSECONDS
+        elapsed = 0.0 if self._output_ns is None else (now_ns - self._output_ns) / NS_PER_S
         step = self.settings.rate_limit * max(elapsed, 0.0)
         return tuple(
             _approach(before, after, step)

@@ -14,12 +14,12 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_interfaces.settings import Settings, setting
+from cg_interfaces.stamps import NS_PER_S
 
 NOMINAL_MODEL = 'compass_gait_mit'
 SOFTWARE = 'compass-gait 0.2.0'
-NANOSECONDS = 1_000_000_000
 CATCH_UP = 2.0  # simulated s per s that a late machine takes at most
-LOCKSTEP_EPOCH_NS = NANOSECONDS  # simulated time starts at 1 s: a stamp of zero means "unset"
+LOCKSTEP_EPOCH_NS = NS_PER_S  # simulated time starts at 1 s: a stamp of zero means "unset"
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class Pace:
     """
 
     def __init__(self, rate_hz: float, start_ns: int):
-        self.period_ns = round(NANOSECONDS / rate_hz)
+        self.period_ns = round(NS_PER_S / rate_hz)
         self.start_ns = start_ns
         self.earliest_ns = start_ns
         self.taken = 0

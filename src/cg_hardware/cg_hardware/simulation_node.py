@@ -33,7 +33,6 @@ from cg_hardware.safety import GateSettings, TorqueGate
 from cg_hardware.sensor_publishers import SensorPublishers, torques_of
 from cg_hardware.simulation import (
     LOCKSTEP_EPOCH_NS,
-    NANOSECONDS,
     Pace,
     SimulationSettings,
     build_plant,
@@ -57,6 +56,7 @@ from cg_interfaces.ros import (
     to_nanoseconds,
     to_stamp,
 )
+from cg_interfaces.stamps import NS_PER_S
 
 RECORDER_WINDOW = 40  # samples that a lock-step run may be ahead of its recorders
 LATE = 0.02  # s behind the clock that are worth a warning
@@ -127,7 +127,7 @@ class SimulationNode(LifecycleNode):
         self.gate = TorqueGate(gate, self.joints)
         self.lockstep = self.settings.mode == 'lockstep'
         self.zeroed_ns = LOCKSTEP_EPOCH_NS if self.lockstep else time.time_ns()
-        zeroed_at = datetime.fromtimestamp(self.zeroed_ns // NANOSECONDS, timezone.utc)
+        zeroed_at = datetime.fromtimestamp(self.zeroed_ns // NS_PER_S, timezone.utc)
         self.note = recording_note(
             self.settings,
             mechanism,
@@ -272,7 +272,7 @@ class SimulationNode(LifecycleNode):
             self._present()
 
     def _stamp(self) -> int:
-        return self.epoch_ns + round(self.ticks * NANOSECONDS / self.settings.sample_rate_hz)
+        return self.epoch_ns + round(self.ticks * NS_PER_S / self.settings.sample_rate_hz)
 
     def _publish_measurement(self) -> None:
         self._measured_ns = self._stamp()
@@ -331,12 +331,12 @@ class SimulationNode(LifecycleNode):
             if not self._apply(self._torque()):
                 return 0.0
         now_ns = time.monotonic_ns()
-        late = self.pace.lateness(now_ns) / NANOSECONDS
+        late = self.pace.lateness(now_ns) / NS_PER_S
         if late > LATE:
             self._warn_late(
                 f'{late:.3f} s late: too busy a machine for real time; no sample is left out'
             )
-        return max(0.0, (self.pace.next_ns - now_ns) / NANOSECONDS)
+        return max(0.0, (self.pace.next_ns - now_ns) / NS_PER_S)
 
     def on_command(self, message: JointState) -> None:
         """Take in a torque command."""
@@ -396,7 +396,7 @@ class SimulationNode(LifecycleNode):
     def _present_when_recorded(self) -> None:
         if self.settings.recorders and self.ticks >= RECORDER_WINDOW:
             behind = self._stamp() - self._recorded_ns()
-            if behind > RECORDER_WINDOW * NANOSECONDS / self.settings.sample_rate_hz:
+            if behind > RECORDER_WINDOW * NS_PER_S / self.settings.sample_rate_hz:
                 if not self._held_back:
                     self._held_back = True
                     self._wait = self.settings.answer_timeout
@@ -427,7 +427,7 @@ class SimulationNode(LifecycleNode):
         if now > self._deadline:
             waited = f'{self._wait:g} s'
             if self._awaiting:
-                seconds = (self._stamp() - self.epoch_ns) / NANOSECONDS
+                seconds = (self._stamp() - self.epoch_ns) / NS_PER_S
                 self._fail(
                     f'no {topics.TORQUE_COMMAND} stamped {self._stamp()} ns (answer to the '
                     f'measurement at {seconds:.3f} s) within {waited}'
@@ -442,7 +442,7 @@ class SimulationNode(LifecycleNode):
         self.plant.latch([0.0] * len(self.joints))
         self.phase = 'finishing'
         self._last_ns = self.epoch_ns + round(
-            (self.ticks - 1) * NANOSECONDS / self.settings.sample_rate_hz
+            (self.ticks - 1) * NS_PER_S / self.settings.sample_rate_hz
         )
         self._deadline = time.monotonic() + self.settings.answer_timeout
 

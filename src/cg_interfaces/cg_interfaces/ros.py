@@ -47,6 +47,7 @@ from cg_dynamics.stop_request import StopRequest, end_at_once, end_with_parent
 from cg_interfaces.localhost import keep_to_localhost
 from cg_interfaces.priority import take_priority
 from cg_interfaces.settings import Settings, describe, table
+from cg_interfaces.stamps import NS_PER_S
 
 SENSOR_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # A publisher keeps a second of its samples: a listener that a busy machine held up gets them all.
@@ -165,13 +166,13 @@ def _descriptor(field: dataclasses.Field, type_: Parameter.Type) -> ParameterDes
 
 def to_stamp(nanoseconds: int) -> Time:
     """ROS stamp of a time in ns."""
-    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    seconds, rest = divmod(nanoseconds, NS_PER_S)
     return Time(sec=seconds, nanosec=rest)
 
 
 def to_nanoseconds(stamp: Time) -> int:
     """Time in ns of a ROS stamp."""
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
+    return stamp.sec * NS_PER_S + stamp.nanosec
 
 
 def publish_status(

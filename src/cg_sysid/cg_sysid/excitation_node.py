@@ -10,7 +10,6 @@ out   /torque_command
 """
 
 import dataclasses
-import struct
 from dataclasses import dataclass
 
 from rclpy.node import Node
@@ -19,13 +18,12 @@ from sensor_msgs.msg import Imu, JointState
 from cg_interfaces import topics
 from cg_interfaces.ros import SENSOR_QOS, DeclaredSettings, run, to_stamp
 from cg_interfaces.settings import setting
+from cg_interfaces.stamps import stamp_of
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
 
 MEASUREMENT_TYPES = {
     topics.IMU: Imu, topics.HIP_ENCODER: JointState, topics.JOINT_STATES: JointState,
 }  # fmt: skip
-STAMP = struct.Struct('<iI')  # at byte 4 of every serialised message that begins with a Header
-HEADER_OFFSET = 4
 RETRY = 0.005  # s
 
 
@@ -78,8 +76,7 @@ class ExcitationNode(Node):
 
     def on_measurement(self, serialised: bytes) -> None:
         """Answer a measurement."""
-        seconds, nanoseconds = STAMP.unpack_from(serialised, HEADER_OFFSET)
-        stamp_ns = seconds * 1_000_000_000 + nanoseconds
+        stamp_ns = stamp_of(serialised)
         if not self.matched:
             # An answer sent before the listeners are matched would be lost.
             self.unanswered_ns = stamp_ns

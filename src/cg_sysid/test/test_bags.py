@@ -9,9 +9,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.typesys import Stores, get_typestore
 
 from cg_dynamics.rig import Setup
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.errors import RecordingError
 from cg_sysid.records import bags
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 START = 1_300_000_000 * NS_PER_S

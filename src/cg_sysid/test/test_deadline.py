@@ -20,11 +20,11 @@ from cg_sysid.cli import diagnose as diagnose_cli
 from cg_sysid.deadline import Deadline, OutOfTime, check_time
 from cg_sysid.diagnosis import conclude
 from cg_sysid.diagnosis.conclude import LAST_FIT
-from cg_sysid.diagnosis.diagnose import Options, diagnose, led_in
+from cg_sysid.diagnosis.diagnose import Options, diagnose
 from cg_sysid.diagnosis.early_end import answer_so_far
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import identify, kept_fits
-from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.data_set import led_in, prepare
 from cg_sysid.identification.identify import fit, score
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.search.task import Task

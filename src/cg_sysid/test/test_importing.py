@@ -14,6 +14,7 @@ import scipy.io
 import yaml
 from scipy.optimize import least_squares
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import recording_of
@@ -22,7 +23,6 @@ from cg_sysid.records.bags import read_bag
 from cg_sysid.records.expressions import evaluate
 from cg_sysid.records.importing import import_logs, import_to_bags
 from cg_sysid.records.noise import measure_noise
-from cg_sysid.records.record import NS_PER_S
 from cg_sysid.records.tables import read_table
 
 REPOSITORY = Path(__file__).resolve().parents[3]

@@ -11,6 +11,7 @@ from two_joint_arm import ARM, FILE, TwoJointArm, arm, install
 
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.loading import load_bags
 from cg_sysid.checks.recordings import check_recording, main
 from cg_sysid.errors import RecordingError
@@ -18,7 +19,6 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.records.bags import read_bag, read_raw, to_record, write_bag
-from cg_sysid.records.record import NS_PER_S
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 START = 1_300_000_000 * NS_PER_S

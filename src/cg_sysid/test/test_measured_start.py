@@ -8,10 +8,10 @@ import pytest
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
-from cg_sysid.diagnosis.diagnose import diagnose, led_in
+from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options
 from cg_sysid.experiments.rehearsal import rehearse
-from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.data_set import led_in, prepare
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import score
 from cg_sysid.identification.measured_start import MeasuredStart, judged

@@ -14,6 +14,7 @@ from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.recordings import check_recording
 from cg_sysid.cli.new_robot import main as new_robot
 from cg_sysid.diagnosis.diagnose import Options, diagnose
@@ -21,7 +22,6 @@ from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.records.bags import read_bag, write_bag
-from cg_sysid.records.record import NS_PER_S
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = 'sensor_msgs/msg/JointState'

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from cg_dynamics.rig import Setup
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.errors import RecordingError
-from cg_sysid.records.record import NS_PER_S, Record, hold, merge_stamps, place
+from cg_sysid.records.record import Record, hold, merge_stamps, place
 
 START = 1_300_000_000 * NS_PER_S
 

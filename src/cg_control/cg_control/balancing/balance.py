@@ -25,8 +25,8 @@ from cg_control.friction import FrictionCompensation, FrictionSettings
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_interfaces.settings import setting
+from cg_interfaces.stamps import NS_PER_S
 
-NANOSECONDS = 1_000_000_000
 IDLE, BALANCING, FALLEN = 'idle', 'balancing', 'fallen'
 
 
@@ -258,7 +258,7 @@ class BalanceController:
         wanted = min(max(wanted, -self.torque_limit), self.torque_limit)
         # A different law must not make the torque jump: the difference dies out.
         law = (stance, self._designs)
-        elapsed = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / NANOSECONDS
+        elapsed = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / NS_PER_S
         if self.settings.hand_over == 0.0:
             self._offset = 0.0
         elif law != self._law:

@@ -9,8 +9,8 @@ import numpy as np
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
 from cg_dynamics.rig import Setup
+from cg_interfaces.stamps import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 FEWEST = 40  # samples that tell anything
 SOME = 10  # periods over which one is taken: a few that come late and are caught up do not matter
 ROUGH = 0.05  # rad/s over which dry friction turns round in the fit of an inertia

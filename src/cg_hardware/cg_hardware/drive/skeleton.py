@@ -25,11 +25,10 @@ import time
 from collections import deque
 from typing import Any
 
-from cg_hardware.drive.can_drive import Answer
+from cg_hardware.drive.can_drive import SILENCE_S, Answer
 from cg_hardware.drive.cia402 import State
 from cg_hardware.drive.objects import DriveError
 
-SILENCE_S = 0.015  # s without an answer after which the drive counts as lost
 NM_PER_AMPERE = 0.05  # CHANGE: of the motor, at its shaft
 MOST_AMPERES = 10.0  # CHANGE: what drive and motor bear
 

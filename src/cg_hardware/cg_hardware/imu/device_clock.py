@@ -15,7 +15,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-NANOSECONDS = 1_000_000_000
+from cg_interfaces.stamps import NS_PER_S
+
 WINDOW_S = 30.0  # s of arrivals that the line is laid under
 BUCKET_S = 0.1  # s of which the earliest arrival is kept
 LARGEST_DRIFT = 1e-3  # of a quartz, ten times what data sheets allow
@@ -70,15 +71,15 @@ class DeviceClock:
         if self._first is not None:
             self._follow(ticks)
             expected = self._host(self._device(ticks))
-            if abs((received_ns - self._first[1]) / NANOSECONDS - expected) > JUMP_S:
+            if abs((received_ns - self._first[1]) / NS_PER_S - expected) > JUMP_S:
                 self.jumps += 1
                 self._restart()
         if self._first is None:
             self._first, self._last_ticks = (ticks, received_ns), ticks
         device = self._device(ticks)
-        self._learn(_Arrival(device, (received_ns - self._first[1]) / NANOSECONDS))
+        self._learn(_Arrival(device, (received_ns - self._first[1]) / NS_PER_S))
         seconds = self._host(device) - self._latency_s
-        return self._first[1] + round(seconds * NANOSECONDS)
+        return self._first[1] + round(seconds * NS_PER_S)
 
     def _follow(self, ticks: int) -> None:
         if self._wrap and ticks - self._last_ticks < -self._wrap // 2:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import APPLIED_TORQUE, JOINT_STATES, TORQUE_COMMAND
 from cg_sysid.checks.signals import Signal
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S
 
 WANTED = (
     'experiment',

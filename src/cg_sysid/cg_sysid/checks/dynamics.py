@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.mechanisms import URDF
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.law import Law, Motion, fit_law, motion_of
 from cg_sysid.checks.signals import RESTING_S, Signal, limit_runs, rests
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.jumps import Step, find_step
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S
 from cg_sysid.records.torque_gaps import over_gap
 
 DRIVEN = 0.25  # torque over the largest of the machine: a joint with less is not driven, [1]

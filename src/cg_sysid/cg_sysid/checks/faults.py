@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.records.findings import CheckReport, Finding
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S
 
 MOST_FAULTS = 4  # faults of one recording
 LEAST_CONTEXT = 0.5  # s before and after a fault

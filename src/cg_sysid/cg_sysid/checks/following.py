@@ -9,11 +9,11 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.kinematics import DEGREES, UNIT_TOLERANCE
 from cg_sysid.checks.signals import Signal
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording, RawTopic
-from cg_sysid.records.record import NS_PER_S
 
 LATEST = 0.5  # s by which a joint may follow
 STEP = 0.005  # s, of the lags that are tried

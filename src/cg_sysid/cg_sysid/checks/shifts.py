@@ -12,13 +12,13 @@ import numpy as np
 from cg_dynamics.mechanisms import URDF
 from cg_dynamics.mechanisms.compass_gait import CompassGait
 from cg_dynamics.model import Model
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.checks.resting import resting_band
 from cg_sysid.checks.sampling import timing_errors
 from cg_sysid.checks.signals import RESTING_S, Signal, rests, without_spikes
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.jumps import Step, find_step, step_at, zero_known_to
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S
 
 SURE = 4.0  # standard deviations within which two numbers count as equal, [1]
 SHORT = 1.5  # sampling times by which a topic that lost samples ends early, at least, [1]

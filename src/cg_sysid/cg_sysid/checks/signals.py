@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.noise import ChannelNoise, channel_noise, resolution
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S
 
 PIECE = 200  # samples
 FROZEN_SAMPLES = 15  # shortest run of one value that is looked at

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import APPLIED_TORQUE, EXPERIMENT, TORQUE_COMMAND
 from cg_sysid.records.clock import FLOOR, independent_arrivals, lost_behind_stamps
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording, RawTopic
-from cg_sysid.records.record import NS_PER_S
 from cg_sysid.records.torque_gaps import torque_gaps
 
 GAP = 2.5  # a spacing this many times the usual one lacks samples, [1]

@@ -29,7 +29,7 @@ from cg_sysid.diagnosis.small_faults import less_small_faults
 from cg_sysid.diagnosis.ties import ties_settled
 from cg_sysid.diagnosis.workspace import Progress, Workspace
 from cg_sysid.errors import Failure
-from cg_sysid.identification.data_set import DataSet, prepare
+from cg_sysid.identification.data_set import DataSet, led_in, prepare
 from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
@@ -38,9 +38,6 @@ from cg_sysid.search.standings import left_undone
 from cg_sysid.search.task import Task
 from cg_sysid.stances.held_foot import held_by_friction
 from cg_sysid.stances.phases import Landing, cut_steps
-
-LEAD_IN_S = 0.1  # of each record, not judged
-LEAD_IN_SHARE = 0.05  # of a short record
 
 
 def split(
@@ -186,16 +183,6 @@ def judging_whole(
     judging = {w.recording: w for w in wholes if w.recording not in fitted}
     replaced = [judging.get(data_set.recording, data_set) for data_set in held]
     return list({data_set.name: data_set for data_set in replaced}.values())
-
-
-def led_in(data_set: DataSet) -> DataSet:
-    """The data set less the outputs of its first moments.
-
-    What went before a record is an assumption of every model with a memory, as a delay; it must
-    not count for or against the model.
-    """
-    begun = data_set.time >= min(LEAD_IN_S, LEAD_IN_SHARE * data_set.duration)
-    return replace(data_set, outputs=np.where(begun[:, None], data_set.outputs, np.nan))
 
 
 def search(work: Workspace) -> Diagnosis:

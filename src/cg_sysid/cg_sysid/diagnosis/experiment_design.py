@@ -18,7 +18,7 @@ from cg_dynamics.model import Model
 from cg_interfaces.channels import interface
 from cg_sysid.experiments.catalogue import Experiment
 from cg_sysid.experiments.excitation import ExcitationSettings, make_signal
-from cg_sysid.identification.data_set import DataSet, as_data_set
+from cg_sysid.identification.data_set import DataSet, as_data_set, led_in
 from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.identify import fit, predict
 from cg_sysid.identification.information_criterion import evidence
@@ -34,7 +34,6 @@ REHEARSED_S = 5.0  # of an experiment; evidence grows with its length
 ITERATIONS = 16
 MOST_RIVALS = 2
 SEED = 20111  # of noise and excitation of the rehearsals
-LEAD_IN_S = 0.1  # of a record, not judged
 
 
 @dataclass(frozen=True)
@@ -141,8 +140,7 @@ def imagined(
     seen = predict(model, data_set, np.array(experiment.initial_state)) + noise
     outputs = dict(zip(body.outputs, seen.T, strict=True))
     data_set = as_data_set(body, replace(record, outputs=outputs), sigma)
-    begun = data_set.time >= LEAD_IN_S
-    return replace(data_set, outputs=np.where(begun[:, None], data_set.outputs, np.nan))
+    return led_in(data_set)
 
 
 def _lost(rival: Fit, data_set: DataSet) -> float:

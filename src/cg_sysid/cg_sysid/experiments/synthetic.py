@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from cg_interfaces.channels import Mechanism, Topic, mechanism
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.records.raw import NOTE_FORMAT, RawRecording, RawTopic
-from cg_sysid.records.record import NS_PER_S
 
 START_NS = 1_300_000_000 * NS_PER_S
 

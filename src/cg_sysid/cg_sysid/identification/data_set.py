@@ -18,9 +18,12 @@ from cg_dynamics.mechanisms import Mechanism
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.records.noise import measure_noise
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 
+LEAD_IN_S = 0.1  # of each record, not judged
+LEAD_IN_SHARE = 0.05  # of a short record
 LATEST = 0.02  # s by which sensors may report late
 FASTEST = 50.0  # rad/s^2 or m/s^2, acceleration of a lively start
 START_WINDOW = 0.03  # s of data behind the first guess of the initial motion
@@ -317,3 +320,13 @@ def measured_motion(
     motion, *_ = np.linalg.lstsq(a * w[:, None], b * w, rcond=None)
     information = (a * w[:, None]).T @ (a * w[:, None])
     return motion, np.linalg.pinv(information)
+
+
+def led_in(data_set: DataSet) -> DataSet:
+    """The data set less the outputs of its first moments.
+
+    What went before a record is an assumption of every model with a memory, as a delay; it must
+    not count for or against the model.
+    """
+    begun = data_set.time >= min(LEAD_IN_S, LEAD_IN_SHARE * data_set.duration)
+    return replace(data_set, outputs=np.where(begun[:, None], data_set.outputs, np.nan))

@@ -18,8 +18,8 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model
 from cg_dynamics.walking.hybrid import Walk, WalkOptions, swing_foot, walk
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.identification.data_set import as_data_set
-from cg_sysid.records.record import NS_PER_S
 from cg_sysid.stances.phases import Landing
 
 BEFORE_S = 0.02  # s before the touchdown at which the simulation sets out

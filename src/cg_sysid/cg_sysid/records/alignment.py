@@ -10,11 +10,12 @@ import numpy as np
 
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import APPLIED_TORQUE, JOINT_STATES, TORQUE_COMMAND
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.clock import mend_clocks
 from cg_sysid.records.raw import RawRecording
-from cg_sysid.records.record import NS_PER_S, SHARED_ROW_NS, Record, hold, merge_stamps, place
+from cg_sysid.records.record import SHARED_ROW_NS, Record, hold, merge_stamps, place
 from cg_sysid.records.torque_gaps import fill_torque
 
 REGULAR_AFTER_SORTING = 0.3  # smallest spacing after sorting over the median, [1]

@@ -21,11 +21,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from cg_interfaces import channels
 from cg_interfaces.channels import IMU, STRING, Topic
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import EXPERIMENT, TORQUE_COMMAND
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.bag_file import BagWriter
 from cg_sysid.records.raw import NOTE_FORMAT
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 
 
 def write_bag(path: str | Path, record: Record, commands: Mapping[str, Any] | None = None) -> Path:

@@ -19,13 +19,14 @@ from cg_description.reading import parse_yaml, path_of, read_text, shown
 from cg_description.schema import Mapping as Form
 from cg_interfaces import channels
 from cg_interfaces.channels import STRING, TRAJECTORY_STATE, Topic
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import EXPERIMENT, JOINT_STATES
 from cg_sysid.errors import RecordingError
 from cg_sysid.records.alignment import to_record
 from cg_sysid.records.bag_integrity import no_bag, require_sound, unfinished
 from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.records.raw import NOTE, RawRecording, RawTopic
-from cg_sysid.records.record import NS_PER_S, SHARED_ROW_NS, Record
+from cg_sysid.records.record import SHARED_ROW_NS, Record
 
 __all__ = [
     'RawRecording',

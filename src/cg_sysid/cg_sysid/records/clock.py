@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cg_interfaces.stamps import NS_PER_S
 from cg_interfaces.topics import EXPERIMENT, TORQUE_COMMAND
 from cg_sysid.records.findings import Finding
 from cg_sysid.records.raw import RawRecording, RawTopic
-from cg_sysid.records.record import NS_PER_S
 
 FEWEST_SAMPLES = 100  # samples of a topic whose clock is looked at
 REGULAR = 0.25  # stamps are regular where most spacings are this close to the usual one, [1]

@@ -35,12 +35,13 @@ from cg_description.schema import (
 from cg_dynamics import rig
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.errors import RecordingError
 from cg_sysid.progress import Bars
 from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.records.expressions import UNITS, Expression, evaluate
 from cg_sysid.records.raw import NOTE, NOTE_FORMAT
-from cg_sysid.records.record import NS_PER_S, Record
+from cg_sysid.records.record import Record
 from cg_sysid.records.tables import Table, read_table
 
 FORMAT = 'cg_import/1'

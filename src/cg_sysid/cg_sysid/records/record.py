@@ -13,10 +13,10 @@ import numpy as np
 
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_interfaces.stamps import NS_PER_S
 from cg_sysid.errors import RecordingError
 
 SHARED_ROW_NS = 1_000  # samples whose stamps differ by no more than this share a row
-NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ there, unless all of them began with the same stamp.
 """
 
 import shutil
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,11 @@ from cg_dynamics.rig import STANCES
 from cg_interfaces import topics
 from cg_interfaces.channels import STRING, mechanism
 from cg_interfaces.settings import Settings, setting
+from cg_interfaces.stamps import stamp_of
 from cg_interfaces.topics import EXPERIMENT
 from cg_sysid.records.journal import Journal
 from cg_sysid.records.recover import JOURNAL_NAME, Recovered, recover
 
-STAMP = struct.Struct('<iI')  # at byte 4 of a serialised message that begins with a Header
-HEADER_OFFSET = 4
 SAME_CLOCK_NS = 10_000_000_000  # stamps this near to the receipt are of the recorder's clock
 WRENCH = 'geometry_msgs/msg/WrenchStamped'
 EXTRA_TOPICS = {
@@ -229,8 +227,7 @@ class Recording:
         """
         recorded = self._topics[topic]
         if recorded.stamped:
-            seconds, nanoseconds = STAMP.unpack_from(data, HEADER_OFFSET)
-            stamp_ns = max(seconds * 1_000_000_000 + nanoseconds, 0)
+            stamp_ns = max(stamp_of(data), 0)
             if self._by_stamp and stamp_ns <= recorded.newest_ns:
                 return  # lock-step repeats its first sample until somebody answers
             recorded.newest_ns = max(recorded.newest_ns, stamp_ns)

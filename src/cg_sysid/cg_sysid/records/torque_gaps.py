@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cg_sysid.records.record import NS_PER_S
+from cg_interfaces.stamps import NS_PER_S
 
 ON_GRID = 0.35  # a gap is a whole number of spacings to within this many of them
 STEADY = 0.15  # the spacings beside it too, or the loop that stamps was only slow there

@@ -5,13 +5,13 @@ The picture is drawn here, once: it needs no interaction and stands on its own w
 
 import math
 
+from cg_sysid.diagnosis.summary import INTERVAL
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.wording import Facts
 from cg_sysid.text import number, scaled
 
 WIDTH, HEIGHT = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 54, 8, 24, 40
-BAND = 1.96  # standard deviations: 95 %
 TICKS = 5
 
 
@@ -65,7 +65,7 @@ def picture(term: Facts) -> Markup:
     factor, unit = scaled(size, term['unit'])
     across, across_unit = scaled(max(abs(s[0]), abs(s[-1])), term['variable_unit'])
     # A band that nothing holds must not flatten what is known.
-    widest = max(abs(y) + BAND * e for y, e in zip(g, sigma, strict=True))
+    widest = max(abs(y) + INTERVAL * e for y, e in zip(g, sigma, strict=True))
     top = 1.25 * max(size, min(2 * size, widest))
     low = -top if min(g) < -0.1 * size else -0.15 * top
     high = top if max(g) > 0.1 * size else 0.15 * top
@@ -80,8 +80,8 @@ def picture(term: Facts) -> Markup:
     def path(points: list[tuple[float, float]]) -> str:
         return 'M' + 'L'.join(f'{x(a):.1f},{y(b):.1f}' for a, b in points)
 
-    upper = [(a, b + BAND * e) for a, b, e in zip(s, g, sigma, strict=True)]
-    lower = [(a, b - BAND * e) for a, b, e in zip(s, g, sigma, strict=True)]
+    upper = [(a, b + INTERVAL * e) for a, b, e in zip(s, g, sigma, strict=True)]
+    lower = [(a, b - INTERVAL * e) for a, b, e in zip(s, g, sigma, strict=True)]
     parts = [
         *_seen(s, [f['seen'][k] for k in keep], x),
         *axis_ticks(s[0], s[-1], across, lambda v, text: (

@@ -2,13 +2,13 @@
 
 import math
 
+from cg_sysid.diagnosis.summary import INTERVAL
 from cg_sysid.report.function import axis_ticks
 from cg_sysid.report.markup import Markup, tag
 from cg_sysid.report.wording import Facts
 
 WIDTH, HEIGHT = 460, 260
 LEFT, RIGHT, TOP, BOTTOM = 54, 8, 24, 40
-BAND = 1.96  # standard deviations: 95 %
 SURE = 0.5  # of the largest impulse; what is known worse is left out of the picture
 
 
@@ -75,8 +75,8 @@ def picture(found: Facts) -> Markup | None:
     for i, a, b in zip(known, spread, lift, strict=True):
         p, q = i['along'], i['off']
         parts += [
-            line(p - BAND * a, q, p + BAND * a, q, 'measured'),
-            line(p, q - BAND * b, p, q + BAND * b, 'measured'),
+            line(p - INTERVAL * a, q, p + INTERVAL * a, q, 'measured'),
+            line(p, q - INTERVAL * b, p, q + INTERVAL * b, 'measured'),
             tag('circle', cx=f'{x(p):.1f}', cy=f'{y(q):.1f}', r=3, class_='dot'),
             tag('circle', cx=f'{x(i["plastic"][0]):.1f}', cy=f'{y(i["plastic"][1]):.1f}', r=4.5,
                 class_='ring'),
