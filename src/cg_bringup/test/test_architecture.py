@@ -58,7 +58,7 @@ FLOORS = {
 }
 GROUND = {
     'cg_control': {
-        '__init__', 'balance_node', 'cost_tuning', 'grow_tree', 'plan_walk',
+        '__init__', 'balance_node', 'cost_tuning', 'feedback_node', 'grow_tree', 'plan_walk',
         'trajectory_server_node', 'tree_controller_node', 'tree_server_node', 'tvlqr_node',
     },
     'cg_sysid': {'__init__', '__main__', 'excitation_node', 'recorder_node'},
