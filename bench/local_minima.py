@@ -21,8 +21,9 @@ from cg_bringup.hidden import hidden_effects_file
 from cg_bringup.runs import NOMINAL_MODEL
 from cg_description.paths import model_path
 from cg_dynamics.model import Model
-from cg_sysid.diagnosis.diagnose import RUNGS, split
+from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.identification.data_set import prepare
+from cg_sysid.search import settings
 from cg_sysid.search.look import Screening, screen
 from cg_sysid.search.outcome import Outcome, own_parameters
 from cg_sysid.search.task import Task
@@ -44,7 +45,7 @@ def attempt(effect, seed, long):
     began = time.monotonic()
     screening = screen(Task(nominal, (effect, None)), train)
     assert isinstance(screening, Screening), screening
-    found = try_candidate(replace(screening.task, iterations=sum(RUNGS)), train, held)
+    found = try_candidate(replace(screening.task, iterations=sum(settings.HALVING.rungs)), train, held)
     took = time.monotonic() - began
     if not isinstance(found, Outcome):
         return values[effect], found, float('inf'), took
