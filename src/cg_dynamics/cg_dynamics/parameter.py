@@ -40,7 +40,6 @@ class Parameter:
             Empty for a property of the machine.
         leeway: Of a parameter of shape, a device of the model: how far from its value the law of
             a real machine may lie, in `unit`, or as a logarithm where it is logarithmic.
-        late: True for one that is let go only where the shapes beside it have left an error.
         along: Unit on a joint that slides where that is not `sliding_unit(unit)`: a phase stays
             one.
         smoothing: True for a rate over which a law of dry friction turns its sign. Machines turn
@@ -65,16 +64,10 @@ class Parameter:
     swept: bool = False
     each: str = ''
     leeway: float = 0.0
-    late: bool = False
     along: str = ''
     smoothing: bool = False
     ends: tuple[str, ...] = ()
     belief: bool = False
-
-    @property
-    def leeway_at_first(self) -> float:
-        """How far it may go where shapes are first let go."""
-        return 0.0 if self.late else self.leeway
 
     def sliding(self) -> 'Parameter':
         """This declaration for a joint that slides."""

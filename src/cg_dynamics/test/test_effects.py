@@ -104,17 +104,17 @@ def test_effect_at_its_default_changes_something(bare, springs, name, site):
         ('coulomb_friction', {'torque': 1.5}, lambda w: -1.5 * np.tanh(w / 0.01)),
         (
             'coulomb_friction',
-            {'torque': 1.5, 'transition_rate': 4e-3, 'slow_share': 0.3, 'slow_ratio': 5.0},
-            lambda w: -1.05 * np.tanh(w / 4e-3) - 0.45 * w / np.hypot(w, 0.02),
+            {'torque': 1.5, 'transition_rate': 3e-3, 'slow_share': 0.3, 'slow_rate': 0.02},
+            lambda w: -1.05 * np.tanh(w / 3e-3) - 0.45 * w / np.hypot(w, 0.02),
         ),
         (
             'coulomb_friction',
-            {'torque': 1.5, 'slow_share': 1.0, 'slow_ratio': 2.0, 'slow_tails': 1.0},
+            {'torque': 1.5, 'slow_share': 1.0, 'slow_rate': 0.02, 'slow_tails': 1.0},
             lambda w: -3.0 / np.pi * np.arctan(np.pi * w / 0.04),
         ),
         (
             'coulomb_friction',
-            {'torque': 1.5, 'slow_share': 0.8, 'slow_ratio': 2.0, 'slow_tails': 0.25},
+            {'torque': 1.5, 'slow_share': 0.8, 'slow_rate': 0.02, 'slow_tails': 0.25},
             lambda w: (
                 -0.3 * np.tanh(w / 0.01)
                 - 0.9 * w / np.hypot(w, 0.02)

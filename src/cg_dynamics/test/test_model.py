@@ -139,15 +139,15 @@ def test_effect_parameters_left_out_take_their_defaults(robot):
 
 def test_a_shape_as_it_always_is_stays_out_of_the_file_and_its_hash(robot):
     """So a law may get another shape, and trees and bags still know the model."""
-    usual = {'coulomb_friction.slow_share': 0.0, 'coulomb_friction.slow_ratio': 1.0,
+    usual = {'coulomb_friction.slow_share': 0.0, 'coulomb_friction.slow_rate': 0.01,
              'coulomb_friction.slow_tails': 0.0}  # fmt: skip
     assert 'slow' not in robot.text()
     assert 'transition_rate' in robot.text()  # simulators differ in it
     shaped = robot.with_values({'coulomb_friction.slow_share': 0.4,
-                                'coulomb_friction.slow_ratio': 2.0,
+                                'coulomb_friction.slow_rate': 0.02,
                                 'coulomb_friction.slow_tails': 0.3})  # fmt: skip
     again = Model.from_text(shaped.text())
-    assert (again.values['coulomb_friction.slow_ratio'], again.hash) == (2.0, shaped.hash)
+    assert (again.values['coulomb_friction.slow_rate'], again.hash) == (0.02, shaped.hash)
     assert shaped.hash != robot.hash
     assert again.with_values(usual).hash == robot.hash
 

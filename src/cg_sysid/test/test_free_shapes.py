@@ -143,42 +143,38 @@ def test_a_shape_that_explains_no_held_out_record_is_not_taken(search, monkeypat
     assert with_shapes_of_causes(work, o) is o
 
 
-def test_soft_friction_by_one_law_is_not_held_up_where_all_of_it_turns_by_the_other(model_file):
+def test_a_mixture_that_ended_pure_is_tried_from_its_middle(model_file, monkeypatch):
+    """Soft friction by one law, held up where all of it turns by the other and the first is hard.
+
+    Nothing says there how fast the first would turn, and a little of it so hard only hurts.
+    """
     nominal = Model.load(model_file)
     soft = nominal.with_values({'coulomb_friction.transition_rate': 0.05})
     work = search_for(nominal, soft)
     model, bounds = with_nuisances(nominal, work.setups())
+    hard = {'coulomb_friction.slow_share': 1.0, 'coulomb_friction.slow_rate': 0.02}
     plain = try_candidate(Task(nominal), work.train, work.held)
     start = started_from(plain.train, model, bounds)
-    other = {'coulomb_friction.slow_share': 1.0, 'coulomb_friction.transition_rate': 0.02}
-    values = [other.get(u.name, v) for u, v in zip(start.unknowns, start.values, strict=True)]
+    values = [hard.get(u.name, v) for u, v in zip(start.unknowns, start.values, strict=True)]
     start = replace(start, values=np.array(values))
-    found = try_candidate(Task(model, bounds=bounds, warm_starts=(start,)), work.train, work.held)
-    ended = found.train.numbers
+    pure = try_candidate(Task(model, bounds=bounds, warm_starts=(start,)), work.train, work.held)
+    ended = _values(pure)
+    assert ended['coulomb_friction.slow_share'] == pytest.approx(1.0, abs=1e-3)
+    assert ended['coulomb_friction.transition_rate'] == pytest.approx(0.01, rel=0.01)
+    mixed = with_mixed_friction(work, pure)
+    assert chi2(mixed) < chi2(pure) - 40.0  # a likelihood ratio that chance gives no three numbers
+    ended = _values(mixed)
     assert ended['coulomb_friction.slow_share'] < 0.1
     assert ended['coulomb_friction.transition_rate'] == pytest.approx(0.05, rel=0.1)
-
-
-def test_friction_of_two_widths_is_told_where_one_width_leaves_an_error(model_file, monkeypatch):
-    """A bearing and a seal: six tenths turn within 3 mrad/s, the rest within 60."""
-    nominal = Model.load(model_file)
-    hidden = {'slow_share': 0.4, 'transition_rate': 0.003, 'slow_ratio': 20.0}
-    machine = nominal.with_values({f'coulomb_friction.{n}': v for n, v in hidden.items()})
-    work = search_for(nominal, machine)
-    model, bounds = with_nuisances(nominal, work.setups())
-    assert 'coulomb_friction.slow_ratio' not in bounds
-    plain = try_candidate(Task(nominal), work.train, work.held)
-    one = try_candidate(Task(model, bounds=bounds), work.train, work.held)
-    two = with_mixed_friction(work, one)
-    assert chi2(two) < chi2(one) - 40.0  # a likelihood ratio that chance gives no number more
-    ended = two.train.numbers
-    assert ended['coulomb_friction.slow_share'] == pytest.approx(0.4, abs=0.1)
-    assert ended['coulomb_friction.slow_ratio'] == pytest.approx(20.0, rel=0.5)
     # Where no shape is free, or the noise is reached, nothing is fitted.
     monkeypatch.setattr(work.halving, 'fit', None)
     assert with_mixed_friction(work, plain) is plain
     monkeypatch.setattr(free_shapes, 'at_noise', lambda o: True)
-    assert with_mixed_friction(work, one) is one
+    assert with_mixed_friction(work, pure) is pure
+
+
+def _values(o):
+    return {u.name: v for u, v in zip(o.train.unknowns, o.train.values, strict=True)}
 
 
 @pytest.mark.parametrize('late', [0.0, 1e-3])

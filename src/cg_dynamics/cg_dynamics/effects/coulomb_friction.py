@@ -20,12 +20,11 @@ class CoulombFriction(Effect):
     Machines and texts let friction turn in other ways, by an arctan or as a root does; and where
     seals and bearings rub at one joint, each turns by itself. So a share may turn more slowly:
 
-        -torque ((1 - s) tanh(x) + s ((1 - t) root(x / r) + t tail(x / r)))   (SLOW)
-        root(x) = x / sqrt(1 + x^2),   tail(x) = 2/pi arctan(pi x / 2),   x = v / transition_rate
+        -torque ((1 - s) tanh(v / transition_rate) + s ((1 - t) root(x) + t tail(x)))   (SLOW)
+        root(x) = x / sqrt(1 + x^2),   tail(x) = 2/pi arctan(pi x / 2),   x = v / slow_rate
 
-    with v the rate, s = slow_share, t = slow_tails and r = slow_ratio. With r = 1 these are laws
-    of one width, drawn in one way or another. Two widths at one joint make up for each other, and
-    are let go last. An arctan has the slowest tails that texts draw.
+    with v the rate, s = slow_share and t = slow_tails. Either rate may come out the smaller one:
+    the parts differ little in shape. An arctan has the slowest tails that texts draw.
     """
 
     name = 'coulomb_friction'
@@ -44,9 +43,8 @@ class CoulombFriction(Effect):
             neutral=0.0, starts=(0.0,), scale=0.1, free=False, leeway=1.0, ends=('lower', 'upper'),
         ),
         Parameter(
-            'slow_ratio', '1', 'rate over which that share turns, over that of the rest',
-            1e-3, 1e3, starts=(1.0,), scale=0.1, free=False, logarithmic=True, leeway=log(500.0),
-            late=True,
+            'slow_rate', 'rad/s', 'rate over which that share turns', 1e-4, 1.0,
+            starts=(0.01,), scale=0.001, free=False, logarithmic=True, leeway=log(5.0),
         ),
         Parameter(
             'slow_tails', '1', 'its way from a root, 0, to an arctan, 1', 0.0, 1.0,
@@ -57,9 +55,8 @@ class CoulombFriction(Effect):
 
     def joint_torque(self, angle, rate, load, z, p):
         """(SLOW), against the rate."""
-        x = rate / p['transition_rate']
-        quick = ca.tanh(x)
-        x /= p['slow_ratio']
+        quick = ca.tanh(rate / p['transition_rate'])
+        x = rate / p['slow_rate']
         root, tail = x / ca.sqrt(1 + x**2), 2 / pi * ca.atan(pi / 2 * x)
         slow = root + p['slow_tails'] * (tail - root)
         return -p['torque'] * (quick + p['slow_share'] * (slow - quick)), []

@@ -77,7 +77,7 @@ def with_events(work: Workspace, final: Outcome, cause: Cause) -> Cause:
     parameters = final.model.effect(cause.label).parameters
     if not any(p.each for p in parameters):
         return cause
-    shapes = {f'{cause.label}.{p.name}': p.leeway for p in parameters if p.leeway_at_first}
+    shapes = {f'{cause.label}.{p.name}': p.leeway for p in parameters if p.leeway}
     task = replace(final.task, bounds={**final.task.bounds, **shapes})
     found = fitted_to_all(work, replace(final, task=task))
     if isinstance(found, Failure):

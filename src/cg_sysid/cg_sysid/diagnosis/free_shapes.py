@@ -98,15 +98,13 @@ def explained_by_own_shapes(work: Workspace, o: Outcome) -> bool:
     prefixes = tuple(f'{label}.' for label in work.added(o))
     bounds = {
         name: declared.leeway for name, declared in o.model.declarations.items()
-        if declared.leeway_at_first and name.startswith(prefixes)
+        if declared.leeway and name.startswith(prefixes)
     }  # fmt: skip
     if o.task.bounds or not bounds:
         return False
     title = f'{title_of(work.added(o))}, its laws in other shapes'
     found = work.halving.fit([_again(o, bounds)], title)[0]
-    if not isinstance(found, Outcome):
-        return False
-    return settled(found) or settled(with_mixed_friction(work, replace(found, label=o.label)))
+    return isinstance(found, Outcome) and settled(found)
 
 
 def _shapes_at(o: Outcome, labels: Sequence[str]) -> Bounds:
@@ -116,37 +114,25 @@ def _shapes_at(o: Outcome, labels: Sequence[str]) -> Bounds:
         f'{effect.label}.{p.name}': p.leeway
         for effect in o.model.effects
         if any(effect is law or _dry_at(effect, law.site) for law in laws)
-        for p in effect.parameters if p.leeway_at_first
+        for p in effect.parameters if p.leeway
     }  # fmt: skip
 
 
 def with_mixed_friction(work: Workspace, o: Outcome) -> Outcome:
-    """The same with all shapes of dry friction let go, if that comes out better.
+    """The same from the middle of mixtures that ended pure, if that comes out better.
 
-    It sets out from the middle of mixtures that ended pure: where a share is none or all the
-    numbers of what is not there show nothing, and a descent that gets there early stays there.
+    Where a share is none or all the numbers of what is not there show nothing: a descent that
+    gets there early stays there.
     """
     declared, values = o.model.declarations, o.train.values.copy()
     for i, u in enumerate(o.train.unknowns):
         pure = min(values[i] - u.lower, u.upper - values[i]) < PURE * (u.upper - u.lower)
         if u.name in o.task.bounds and set(declared[u.name].ends) == {'lower', 'upper'} and pure:
             values[i] = (u.lower + u.upper) / 2
-    bounds = dict(o.task.bounds) | {
-        f'{effect.label}.{p.name}': p.leeway
-        for effect in o.model.effects if _let_go(o, effect)
-        for p in effect.parameters if p.late
-    }  # fmt: skip
-    unchanged = bounds == o.task.bounds and np.array_equal(values, o.train.values)
-    if at_noise(o) or unchanged:
+    if at_noise(o) or np.array_equal(values, o.train.values):
         return o
     mixed = replace(o, train=replace(o.train, values=values))
-    return _if_better(work, o, _again(mixed, bounds), 'with mixed friction')
-
-
-def _let_go(o: Outcome, effect: Effect) -> bool:
-    """Whether shapes of an effect's law may move."""
-    return any(p.leeway_at_first and f'{effect.label}.{p.name}' in o.task.bounds
-               for p in effect.parameters)  # fmt: skip
+    return _if_better(work, o, _again(mixed, o.task.bounds), 'with mixed friction')
 
 
 def with_hard_friction(work: Workspace, o: Outcome) -> Outcome:

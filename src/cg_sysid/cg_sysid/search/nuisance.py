@@ -46,7 +46,7 @@ def with_nuisances(model: Model, setups: Sequence[Setup]) -> tuple[Model, Bounds
     bounds = {}
     for effect in model.effects:
         for declared in effect.parameters:
-            if declared.leeway_at_first:
+            if declared.leeway:
                 bounds[f'{effect.label}.{declared.name}'] = declared.leeway
     # What is late before steps has no slope by its delay, and no fit finds it.
     late = LATE_READING if any(effect.steps for effect in model.effects) else ALSO[LATE_READING]

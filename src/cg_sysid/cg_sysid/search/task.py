@@ -139,6 +139,6 @@ def as_cause(task: Task) -> Task:
     if task.effect is None or not task.bounds:
         return task
     own = f'{label_of(task)}.'
-    shapes = {f'{own}{p.name}': p.leeway_at_first for p in _declared(task) if p.leeway_at_first}
+    shapes = {f'{own}{p.name}': p.leeway for p in _declared(task) if p.leeway}
     others = {n: b for n, b in task.bounds.items() if not n.startswith(own)}
     return replace(task, bounds=others | shapes)
