@@ -79,9 +79,10 @@ def test_the_answer_is_that_of_local_processes(processes, local, loaded, model_f
     options = Options(effects=EFFECTS, rounds=1)
     with Cluster(processes.address) as workers, processes.client() as client:
         found = diagnose(Model.load(model_file), loaded.records, options, executor=workers)
-        # Two sets of data sets, sent once each, however many fits there were.
+        # Two sets of data sets, sent once each, however many fits there were; and for the last
+        # fit both together, and where it sets out.
         sent = [key for key in tasks(client) if key.startswith('compass_gait')]
-    assert len(sent) == 2
+    assert len(sent) == 4
     assert_same(found, local)
 
 
