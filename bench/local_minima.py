@@ -45,7 +45,9 @@ def attempt(effect, seed, long):
     began = time.monotonic()
     screening = screen(Task(nominal, (effect, None)), train)
     assert isinstance(screening, Screening), screening
-    found = try_candidate(replace(screening.task, iterations=sum(settings.HALVING.rungs)), train, held)
+    found = try_candidate(
+        replace(screening.task, iterations=sum(settings.HALVING.rungs)), train, held
+    )
     took = time.monotonic() - began
     if not isinstance(found, Outcome):
         return values[effect], found, float('inf'), took
