@@ -58,7 +58,7 @@ FLOORS = {
 }
 GROUND = {
     'cg_control': {
-        '__init__', 'balance_node', 'cost_tuning', 'feedback_node', 'grow_tree', 'plan_walk',
+        '__init__', 'balance_node', 'cost_tuning', 'state_feedback', 'grow_tree', 'plan_walk',
         'trajectory_server_node', 'tree_controller_node', 'tree_server_node', 'tvlqr_node',
     },
     'cg_sysid': {'__init__', '__main__', 'excitation_node', 'recorder_node'},
@@ -67,7 +67,7 @@ ROS = {
     'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'rcl_interfaces', 'rclpy', 'sensor_msgs',
     'std_msgs', 'std_srvs', 'trajectory_msgs', 'visualization_msgs',
 }  # fmt: skip
-ROS_HELPERS = {'ros', 'drive_publishers', 'sensor_publishers'}
+ROS_HELPERS = {'ros', 'drive_publishers', 'sensor_publishers', 'state_feedback'}
 
 
 def imports(path):

@@ -1,6 +1,6 @@
 """ROS node of the balance controller.
 
-The law is in balancing/balance.py, what it shares with others in feedback_node.py.
+The law is in balancing/balance.py, what it shares with others in state_feedback.py.
 
 in    /state, /applied_torque
 out   /torque_command, /diagnostics
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cg_control.balancing.balance import BALANCING, BalanceController
-from cg_control.feedback_node import FeedbackNode, FeedbackSettings
+from cg_control.state_feedback import FeedbackNode, FeedbackSettings
 from cg_interfaces.ros import run
 from cg_interfaces.settings import setting
 

@@ -1,6 +1,6 @@
 """ROS node that follows a tree.
 
-The law is in trees/recovery.py, what it shares with other nodes in feedback_node.py.
+The law is in trees/recovery.py, what it shares with other nodes in state_feedback.py.
 
 The tree is the file that /tree/selected names. A thread loads it, and the robot follows it from
 the next state on; a tree of another model, or a file that has changed since, is refused, and the
@@ -23,7 +23,7 @@ from std_msgs.msg import Int32, String
 
 from cg_control.answer_age import percentiles
 from cg_control.balancing.balance import BALANCING
-from cg_control.feedback_node import FeedbackNode, FeedbackSettings
+from cg_control.state_feedback import FeedbackNode, FeedbackSettings
 from cg_control.trees.recovery import FOLLOWING, KEPT, RecoverySettings, TreeController
 from cg_control.trees.tree_files import TreeSelection
 from cg_control.trees.tree_loader import TreeLoader

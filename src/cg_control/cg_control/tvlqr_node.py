@@ -1,6 +1,6 @@
 """ROS node of the TVLQR controller.
 
-Control is in following/execution.py, what it shares with other nodes in feedback_node.py.
+Control is in following/execution.py, what it shares with other nodes in state_feedback.py.
 
 Until a trajectory is started it balances; then it follows the trajectory, and balances on the leg
 on which that ends. What it follows is the text on /trajectory/selected; when, is said by
@@ -18,13 +18,13 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from cg_control.balancing.balance import BALANCING
-from cg_control.feedback_node import FeedbackNode, FeedbackSettings
 from cg_control.following.execution import (
     CAUGHT,
     TRACKING,
     ExecutionSettings,
     TrajectoryController,
 )
+from cg_control.state_feedback import FeedbackNode, FeedbackSettings
 from cg_control.trajectories.trajectory import Trajectory, TrajectoryError
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, run
 from cg_interfaces.settings import setting
