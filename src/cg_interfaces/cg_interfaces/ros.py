@@ -73,7 +73,10 @@ PARAMETER_TYPES = {
 }
 
 
-class DeclaredSettings:
+S = typing.TypeVar('S', bound=Settings)
+
+
+class DeclaredSettings(typing.Generic[S]):
     """The settings of a node, declared as ROS parameters and kept up to date.
 
     Attributes:
@@ -83,7 +86,7 @@ class DeclaredSettings:
     def __init__(
         self,
         node: Node,
-        kind: type[Settings],
+        kind: type[S],
         at_work: Callable[[], bool] = lambda: True,
     ):
         """Declare every field of `kind` on the node.
@@ -100,7 +103,7 @@ class DeclaredSettings:
         given = {}
         for field in dataclasses.fields(kind):
             given[field.name] = _declare(node, field, PARAMETER_TYPES[hints[field.name]])
-        self.values = kind(**given)
+        self.values: S = kind(**given)
         self._at_work = at_work
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._adopt)
