@@ -14,6 +14,7 @@ in    /state, /applied_torque
 out   /torque_command, /diagnostics
 """
 
+import abc
 import dataclasses
 import math
 import time
@@ -64,7 +65,7 @@ class FeedbackSettings(BalanceSettings):
     )
 
 
-class FeedbackNode(Node):
+class FeedbackNode(Node, abc.ABC):
     """Publishes /torque_command.
 
     A node of its own says which law it follows (`law`), what ends it (`interrupt`), and how to
@@ -112,13 +113,13 @@ class FeedbackNode(Node):
         """Whether to design on the transmission too."""
         return False
 
+    @abc.abstractmethod
     def law(self) -> Any:
         """The controller, around that of `design`."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def interrupt(self) -> None:
         """End what the law was at: what comes next has nothing to do with what was."""
-        raise NotImplementedError
 
     def adopt(self, settings: Any) -> None:
         """Take over settings that have changed."""
