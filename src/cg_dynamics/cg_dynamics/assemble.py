@@ -273,15 +273,23 @@ class _Assembly:
         moved = [e.foot(body, self.own[e.label]) for e in self.effects if overrides(e, 'foot')]
         body = replace(body, foot=sum(moved, body.foot))
         a = ca.SX.sym('a', *self.s.shape)
-        recursion = mechanism.recursion(q, v, ca.mtimes(basis, a), self.by_name, up)
-        energies = mechanism.energies(q, v, self.by_name, self.setup, up, body.foot)
+        loads = {e.label: tied for e in self.effects if (tied := e.load(self.own[e.label]))}
+        recursion = mechanism.recursion(
+            q, v, ca.mtimes(basis, a), self.by_name, up, tuple(loads.values())
+        )
+        kinetic, potential = mechanism.energies(q, v, self.by_name, self.setup, up, body.foot)
         # What recursion does not give is derived from the energies.
-        kinetic, potential = energies if recursion is None else (ca.SX(0), ca.SX(0))
+        given = ca.SX(0)
+        if recursion is not None:
+            given, kinetic, potential = kinetic + potential, ca.SX(0), ca.SX(0)
         for stretch, stiffness in body.springs():
             potential += stiffness * stretch**2 / 2
         for e in self.effects:
             more_kinetic, more_potential = e.energies(body, self.own[e.label])
-            kinetic, potential = kinetic + more_kinetic, potential + more_potential
+            if recursion is not None and e.label in loads:
+                given += more_kinetic + more_potential
+            else:
+                kinetic, potential = kinetic + more_kinetic, potential + more_potential
         force = self._force(body, torques)
         kinetic, potential, force = self._in_free([kinetic, potential, force])
         mass_matrix, bias = manipulator(kinetic, potential, self.s, self.ds)
@@ -294,7 +302,7 @@ class _Assembly:
                 [
                     ca.mtimes(basis.T, taken),
                     ca.mtimes([basis.T, own_mass, basis]),
-                    energies[0] + energies[1],
+                    given,
                 ]
             )
             load -= ca.substitute(taken, a, ca.SX.zeros(a.shape))

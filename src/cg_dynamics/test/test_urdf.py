@@ -398,6 +398,28 @@ def test_a_payload_is_as_a_welded_link():
         np.testing.assert_allclose(carrying(motion, u, p), heavier(motion, u, p0), rtol=1e-4)
 
 
+@pytest.mark.parametrize('link', ['link_1', 'link_2', 'tip'])
+def test_a_load_takes_power_as_its_energies_say(link):
+    # Recursion carries the load; its energies are derived from where it is. Without friction the
+    # power of the drives is all that changes their sum with those of the robot.
+    tip = """<link name="tip"/><joint name="tie" type="fixed"><parent link="link_3"/>
+      <child link="tip"/><origin xyz="0.1 -0.3 0.2" rpy="0.4 -0.7 1.1"/></joint></robot>"""
+    bare = robot(random_tree(8, 3).replace('</robot>', tip))
+    carrying = bare.with_effect('payload', link, mass=0.7, x=0.3, y=-0.2, z=0.1)
+    e, without = assemble(carrying, Setup()), assemble(bare, Setup())
+    power = ca.jtimes(e.energy, e.x, e.rates) - ca.dot(e.u, e.x[3:6])
+    f = ca.Function('power', [e.x, e.u, e.p], [power, e.energy])
+    energy = ca.Function('energy', [without.x, without.p], [without.energy])
+    p, p0 = (parameter_vector(model, Setup()) for model in (carrying, bare))
+    random = np.random.default_rng(5)
+    for _ in range(5):
+        motion, u = random.normal(size=6), random.normal(size=3)
+        unaccounted, all_of_it = map(float, f(motion, u, p))
+        # Rounding of some hundred terms of the size of the energy.
+        assert abs(unaccounted) < 1e-9 * (1 + abs(all_of_it))
+        assert abs(all_of_it - float(energy(motion, p0))) > 1e-3
+
+
 def test_a_tilted_base_is_as_tilted_gravity():
     model = robot(random_tree(8, 3))
     tilted, p = equations(model.with_effect('ground_slope', x=0.03, y=-0.05))

@@ -5,7 +5,7 @@ receives what flows through that place and returns what leaves it. The order alo
 path is the order of the hooks below, so any effects compose:
 
     input --input_delay--> command --> deliver --> transmit --> joint_torque --> M dv/dt + b = Q
-    Q and M also take energies, force, foot and up;   outputs: read, then output_delay
+    Q and M also take energies, load, force, foot and up;   outputs: read, then output_delay
     where a foot lands: landing
 
 In every hook `p` maps the effect's own parameter names to symbols and `z` holds its own extra
@@ -23,7 +23,7 @@ from typing import ClassVar
 import casadi as ca
 
 from cg_dynamics.errors import ModelError
-from cg_dynamics.mechanisms.mechanism import Mechanism
+from cg_dynamics.mechanisms.mechanism import Mechanism, PointMass
 from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 
@@ -308,6 +308,13 @@ class Effect:
     def energies(self, body: Body, p: Symbols) -> tuple[ca.SX, ca.SX]:
         """Kinetic and potential energy in J that the effect adds."""
         return ca.SX(0), ca.SX(0)
+
+    def load(self, p: Symbols) -> PointMass | None:
+        """The point mass behind these energies, where it is one in the frame of a body in space.
+
+        Recursion carries it with the body, at next to no cost.
+        """
+        return None
 
     def force(self, body: Body, z: list[ca.SX], p: Symbols) -> tuple[ca.SX, list[ca.SX]]:
         """Generalised force in N m that the effect adds, shape (n, 1)."""

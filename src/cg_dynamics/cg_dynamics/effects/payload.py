@@ -5,6 +5,7 @@ from dataclasses import replace
 import casadi as ca
 
 from cg_dynamics.effects.effect import BodyEffect
+from cg_dynamics.mechanisms.mechanism import PointMass
 from cg_dynamics.parameter import Parameter
 
 SHARES = 0.3, 1.0  # of what a joint carries: masses from which an identification sets out
@@ -42,10 +43,16 @@ class Payload(BodyEffect):
             for axis, at in zip('xyz', centre, strict=True)
         ))  # fmt: skip
 
+    def load(self, p):
+        """In space it is a part of its body."""
+        if 'distance' in p:
+            return None
+        return PointMass(self.site, p['mass'], ca.vertcat(p['x'], p['y'], p['z']))
+
     def energies(self, body, p):
         """Energies of the point mass."""
-        spatial = body.mechanism.dimensions == 3
-        place = ca.vertcat(p['x'], p['y'], p['z']) if spatial else p['distance']
+        load = self.load(p)
+        place = p['distance'] if load is None else load.place
         position, velocity = body.point(self.site, place)
         return (
             p['mass'] * ca.sumsqr(velocity) / 2,

@@ -1,7 +1,7 @@
 """What a mechanism is: coordinates, energies, joints and what its sensors see."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -27,6 +27,21 @@ class Kinematics:
     names: tuple[str, ...]
     basis: ca.DM
     offset: ca.DM = field(default_factory=lambda: ca.DM(0))
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """What an effect ties to a body.
+
+    Attributes:
+        body: Name of the body.
+        mass: In kg.
+        place: In the frame of the body, m, shape (3, 1).
+    """
+
+    body: str
+    mass: ca.SX
+    place: ca.SX
 
 
 class Mechanism(ABC):
@@ -144,12 +159,18 @@ class Mechanism(ABC):
         return ca.SX([0, 1])
 
     def recursion(
-        self, q: ca.SX, v: ca.SX, a: ca.SX, p: Symbols, up: ca.SX
+        self,
+        q: ca.SX,
+        v: ca.SX,
+        a: ca.SX,
+        p: Symbols,
+        up: ca.SX,
+        loads: Sequence[PointMass] = (),
     ) -> tuple[ca.SX, ca.SX] | None:
         """Mass matrix M(q), shape (n, n), and the forces M a + b that a takes, shape (n, 1).
 
-        A mechanism of many joints has them by recursion; for None they are derived from the
-        energies.
+        A mechanism of many joints has them by recursion, with the loads that its bodies carry; for
+        None they are derived from the energies.
         """
         return None
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from cg_description.robot_description import Inertial, Joint, RobotDescription, rotation
 from cg_dynamics.errors import ModelError
-from cg_dynamics.mechanisms.mechanism import Kinematics, Mechanism, Symbols
+from cg_dynamics.mechanisms.mechanism import Kinematics, Mechanism, PointMass, Symbols
 from cg_dynamics.parameter import Parameter
 from cg_dynamics.rig import Setup
 
@@ -52,6 +52,8 @@ ROUNDED = 0.02  # share by which a principal moment may exceed the sum of the ot
 POSES, POSES_WITHIN = 16, 1.5  # poses for a mean inertia, and how far from zero, rad (m)
 PROBES = 40  # motions at which the numbers are looked at that could matter
 DETERMINED = 1e-8  # relative size of what a motion has to show of a number
+# Mass in kg, first moment in kg m, (3, 1), and inertia about the origin of a link, (3, 3).
+Mass = tuple[ca.SX, ca.SX, ca.SX]
 
 
 class Urdf(Mechanism):
@@ -197,11 +199,11 @@ class Urdf(Mechanism):
             read |= dict(zip(self.outputs[len(self.coordinates) :], ca.vertsplit(v), strict=True))
         return read
 
-    def recursion(self, q, v, a, p: Symbols, up):
+    def recursion(self, q, v, a, p: Symbols, up, loads=()):
         """(CRB) and (NE)."""
-        return self.mass_matrix(q, p), self.inverse_dynamics(q, v, a, p, up)
+        return self.mass_matrix(q, p, loads), self.inverse_dynamics(q, v, a, p, up, loads)
 
-    def inverse_dynamics(self, q, v, a, p: Symbols, up):
+    def inverse_dynamics(self, q, v, a, p: Symbols, up, loads: Sequence[PointMass] = ()):
         """Forces that an acceleration takes, by (NE), from the base out and back."""
         to_tree, _ = self._tree
         placed, place = self._placed(q), self._order
@@ -221,13 +223,13 @@ class Urdf(Mechanism):
                     dw = dw + ca.cross(w, axis) * v[k] + axis * a[k]
                     w = w + axis * v[k]
             motion[joint.child] = w, dw, acceleration
-        loads = dict.fromkeys(self.description.links, (still, still))
-        inertias = {j.child: b.symbols(p) for j, b in zip(self.moving, self._bodies, strict=True)}
+        needs = dict.fromkeys(self.description.links, (still, still))
+        masses = self._loaded(p, loads)
         needed = [ca.SX(0)] * len(self.moving)
         for joint in reversed(self.description.joints):
-            force, moment = loads[joint.child]
-            if joint.child in inertias:
-                m, h, inertia = inertias[joint.child]
+            force, moment = needs[joint.child]
+            if joint.child in masses:
+                m, h, inertia = masses[joint.child]
                 w, dw, acceleration = motion[joint.child]
                 force = force + m * acceleration + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
                 moment = (
@@ -236,23 +238,21 @@ class Urdf(Mechanism):
                     + ca.cross(w, ca.mtimes(inertia, w))
                     + ca.cross(h, acceleration)
                 )
+            if joint.name in place:
                 needed[place[joint.name]] = ca.dot(
                     ca.DM(joint.axis), force if joint.slides else moment
                 )
             turn, origin = placed[joint.name]
             force, moment = ca.mtimes(turn, force), ca.mtimes(turn, moment)
-            f, n = loads[joint.parent]
-            loads[joint.parent] = f + force, n + moment + ca.cross(origin, force)
+            f, n = needs[joint.parent]
+            needs[joint.parent] = f + force, n + moment + ca.cross(origin, force)
         return ca.mtimes(to_tree.T, ca.vertcat(*needed))
 
-    def mass_matrix(self, q, p: Symbols):
+    def mass_matrix(self, q, p: Symbols, loads: Sequence[PointMass] = ()):
         """M(q) by (CRB): each joint moves all that it carries, as one body."""
         to_tree, _ = self._tree
         placed, place = self._placed(q), self._order
-        nothing = (ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3))
-        carried = dict.fromkeys(self.description.links, nothing)
-        for joint, body in zip(self.moving, self._bodies, strict=True):
-            carried[joint.child] = body.symbols(p)
+        carried = dict.fromkeys(self.description.links, _nothing()) | self._loaded(p, loads)
         matrix = ca.SX.zeros(len(self.moving), len(self.moving))
         above = {joint.child: joint for joint in self.description.joints}
         for joint in reversed(self.description.joints):
@@ -288,6 +288,22 @@ class Urdf(Mechanism):
                 - ca.mtimes(moment_arm, arm),
             )
         return ca.mtimes([to_tree.T, matrix, to_tree])
+
+    def masses(self, p: Symbols) -> dict[str, Mass]:
+        """Link -> what it weighs, with all that is fixed to it."""
+        return {j.child: b.symbols(p) for j, b in zip(self.moving, self._bodies, strict=True)}
+
+    def _loaded(self, p: Symbols, loads: Sequence[PointMass]) -> dict[str, Mass]:
+        found, homes = self.masses(p), _homes(self.description)
+        for load in loads:
+            body, turn, origin = homes[load.body]
+            place = ca.DM(origin) + ca.mtimes(ca.DM(turn), load.place)
+            m, h, inertia = found.get(body, _nothing())
+            arm = ca.skew(place)
+            found[body] = (
+                m + load.mass, h + load.mass * place, inertia - load.mass * ca.mtimes(arm, arm)
+            )  # fmt: skip
+        return found
 
     def joints_to(self, body: str) -> tuple[str, ...]:
         """Joints that move a body, the one at the base first; of those that follow their leaders.
@@ -436,10 +452,10 @@ class _Body:
                 scale=BELIEF, logarithmic=neutral == 1.0, belief=True,
             )  # fmt: skip
 
-    def symbols(self, p) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Mass in kg, first moment in kg m, (3, 1), and inertia about the origin, (3, 3)."""
+    def symbols(self, p) -> Mass:
+        """All that it weighs."""
         if not self.mass:
-            return ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3)
+            return _nothing()
         x = {name: p[f'{self.link}_{name}'] for name, *_ in NUMBERS}
         mass = self.mass * x['mass']
         factor = ca.DM(self.gyration)
@@ -465,6 +481,10 @@ class _Body:
         return Inertial(
             mass, (x, y, z), (i[0][0], i[1][1], i[2][2], i[0][1], i[0][2], i[1][2])
         )  # fmt: skip
+
+
+def _nothing() -> Mass:
+    return ca.SX(0), ca.SX.zeros(3), ca.SX.zeros(3, 3)
 
 
 def _child_frame(joint: Joint, position: ca.SX | None) -> tuple[ca.SX, ca.SX]:
@@ -494,19 +514,24 @@ def _place(description: RobotDescription, joint: Joint) -> str:
         link = behind[0].child
 
 
-def _bodies(description: RobotDescription) -> tuple[_Body, ...]:
-    """What each joint that moves carries, with the links that are fixed to it."""
-    home: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # link -> body, its frame there
-    sums: dict[str, np.ndarray] = {}  # body -> sum over its mass of (x, 1)(x, 1)', in its frame
+def _homes(description: RobotDescription) -> dict[str, tuple[str, np.ndarray, np.ndarray]]:
+    """Link that moves -> body that it belongs to, and its orientation and origin in that frame."""
+    home: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
     for joint in description.joints:
         if joint.kind != 'fixed':
             home[joint.child] = (joint.child, np.eye(3), np.zeros(3))
-            sums[joint.child] = np.zeros((4, 4))
         elif joint.parent in home:
             body, turn, origin = home[joint.parent]
             here = np.array(rotation(joint.rpy))
             home[joint.child] = (body, turn @ here, origin + turn @ np.array(joint.xyz))
-    for link, (body, turn, origin) in home.items():
+    return home
+
+
+def _bodies(description: RobotDescription) -> tuple[_Body, ...]:
+    """What each joint that moves carries, with the links that are fixed to it."""
+    # Body -> sum over its mass of (x, 1)(x, 1)', in its frame.
+    sums = {joint.child: np.zeros((4, 4)) for joint in description.moving}
+    for link, (body, turn, origin) in _homes(description).items():
         found = description.inertials.get(link)
         if found is None:
             continue

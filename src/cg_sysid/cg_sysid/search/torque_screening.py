@@ -433,9 +433,14 @@ def _as_predicted(
 class _Weightless(Urdf):
     """The joints of a robot without the bodies: what is left of its equations are the forces."""
 
-    def recursion(self, q, v, a, p, up):
-        """Nothing has to be moved; a mass lets the equations be written down."""
-        return ca.SX.eye(q.shape[0]), ca.SX.zeros(q.shape)
+    def recursion(self, q, v, a, p, up, loads=()):
+        """Loads only have to be moved; a mass lets the equations be written down."""
+        mass, taken = super().recursion(q, v, a, p, up, loads)
+        return mass + ca.SX.eye(q.shape[0]), taken
+
+    def masses(self, p):
+        """None."""
+        return {}
 
     def energies(self, q, v, p, setup, up, foot=None):
         """None."""
