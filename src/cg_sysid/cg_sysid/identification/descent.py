@@ -28,7 +28,9 @@ BACK = 5  # steps across a valley after one uphill, at most
 CLOSE = 1e4  # chi2/N; farther from the noise nobody needs the floor of a valley
 ROUNDING = 1e-12  # share of a curvature that elimination of other unknowns may leave by chance
 HALF = 0.5  # share that a step takes off a positive value, before it takes less than it says
-DAMPING = 1e-3  # of the first step
+DAMPING, LEAST_DAMPING = 1e-3, 1e-13  # of the first step, and of any
+ALONG = 0.1  # of what is still to be gained: a step that gains less has met the floor of a valley
+LEAP = 1e3  # ratio of its damping to that of the next, as long as no step was too long
 SHORT = 0.5  # damping from which a step is short
 
 
@@ -138,6 +140,7 @@ class _Way:
         point = start.point(weight)
         assert point is not None
         self._here, self._theta, self._motions, self._damping = start, theta, motions, damping
+        self._too_long = False  # whether a step was
         self._began, self.errors = float(point.cost), [error_of(point)]
         # The border's weight follows what is still to be gained (a central path): whoever meets
         # the border early creeps along it ever after.
@@ -189,11 +192,14 @@ class _Way:
         self._here, self._theta, self._motions = trial, trial.theta, trial.motions
         self._point = there
         self.errors.append(error_of(there))
-        self._damping = max(self._damping / 10, 1e-9)
+        promised = _promised(there, self._frozen(self._theta, there))
+        # Most of what is to be gained lies along the floor, where damped steps do not go.
+        leap = self._valley is FAR and gain < ALONG * promised and not self._too_long
+        self._damping = max(self._damping / (LEAP if leap else 10), LEAST_DAMPING)
         small = max(drift * there.cost, SMALL_GAIN)
         little = gain < small and self._barrier <= max(BARRIER, CENTRAL * small)
         # A short step gains little too.
-        if little and _promised(there, self._frozen(self._theta, there)) < small:
+        if little and promised < small:
             return True
         lower = max(BARRIER, min(self._barrier, CENTRAL * gain))
         self._point, self._barrier = there.beside(self._barrier, lower), lower
@@ -203,6 +209,7 @@ class _Way:
         """A shorter step next time; `tried` is the cost of this one."""
         if self._point.cost <= tried < (1 + 1e-9) * self._point.cost:
             return True
+        self._too_long = True
         if self._damping > SHORT:
             # Before, a step that gains nothing only says that it was too long.
             self.errors.append(error_of(self._point))

@@ -361,7 +361,7 @@ def _descend(
         converged = steady and (found.converged or idle) and not leads
         if converged or found.hopeless:
             break
-        weight, damping = new, found.damping if steady else DAMPING
+        weight, damping = new, found.damping if steady else max(DAMPING, found.damping)
     point = found.point
     assert point is not None
     end = End(
