@@ -308,7 +308,7 @@ def test_what_moves_beside_one_joint_does_not_contest_small_faults_at_others():
     plain, faulty = (
         try_candidate(task, train, held) for task in (Task(believed), Task(model, bounds=bounds))
     )
-    off = {name.rpartition('.')[0] for name in small_faults.shapes_off(faulty)}
+    off = {name.rpartition('.')[0] for name in small_faults.shapes_off(faulty, faulty.model)}
     assert {f'coulomb_friction@{joint}' for joint in ('thigh_joint', 'shank_joint')} <= off
     assert at_noise(faulty)
     idle = small_faults.beside_one_joint(work, plain, faulty)

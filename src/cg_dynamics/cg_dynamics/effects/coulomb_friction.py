@@ -52,6 +52,11 @@ class CoulombFriction(Effect):
         ),
     )  # fmt: skip
     largest_step = 0.002
+    drawings = (
+        {'slow_share': 0.0},
+        {'slow_share': 1.0, 'slow_tails': 0.0},
+        {'slow_share': 1.0, 'slow_tails': 1.0},
+    )
 
     def joint_torque(self, angle, rate, load, z, p):
         """(SLOW), against the rate."""

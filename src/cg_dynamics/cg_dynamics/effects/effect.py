@@ -135,6 +135,7 @@ class Effect:
         ripple: True where its slope changes sign within small motions, so that the slope at one
             state tells nothing of those around it.
         steps: True where it answers in steps, so that what acts before it has next to no slope.
+        drawings: Shapes in which texts and machines draw its law, each by parameters of shape.
         at: Joint, body or sensor where this instance acts; None where there is only one.
         start_torque: START_TORQUE at a joint of this size, N m (N where it slides).
     """
@@ -153,6 +154,7 @@ class Effect:
     family: ClassVar[tuple[str, ...]] = ()
     ripple: ClassVar[bool] = False
     steps: ClassVar[bool] = False
+    drawings: ClassVar[tuple[Mapping[str, float], ...]] = ()
 
     def __init__(self, mechanism: Mechanism, at: str | None = None):
         sites = self.sites(mechanism)

@@ -42,8 +42,15 @@ LAST_FIT = 'the last fit, to all records'
 TURNS = 3  # periods that a term of a short stretch of an angle is tried with
 
 
-def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
-    """The answer when nothing more is earned: look-alikes, causes, last fits, verdict."""
+def conclude(work: Workspace, stated: Outcome, nominal: Outcome, final: Outcome) -> Diagnosis:
+    """The answer when nothing more is earned: look-alikes, causes, last fits, verdict.
+
+    Args:
+        work: What is known.
+        stated: The nominal model as the file states it, against which the gain is told.
+        nominal: The same with its laws as the machine draws them, on top of which causes stand.
+        final: What stands.
+    """
     unmodelled = None
     if work.left(with_law(work, final)):
         unmodelled, stand = what_remains(
@@ -62,11 +69,11 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     wandering = wandering_number(work, final) if left else None
     if wandering and unmodelled and unmodelled.explained > wandering.explained:
         wandering = None  # the same for all records, and more
-    share = share_explained(nominal.held, final.held)
+    share = share_explained(stated.held, final.held)
     verdict = verdict_of(causes, bool(left), share)
     late = ''
     if verdict == Verdict.UNEXPLAINED or not (causes or at_noise(final)):
-        late = told_late_samples(work, gained(work, nominal, final))
+        late = told_late_samples(work, gained(work, stated, final))
     if late:
         verdict = Verdict.UNEXPLAINED
     try:
@@ -74,7 +81,7 @@ def conclude(work: Workspace, nominal: Outcome, final: Outcome) -> Diagnosis:
     except OutOfTime:
         model, unfinished = None, left_undone(work.deadline, LAST_FIT)
     return answer(
-        work, nominal, final, causes, verdict, unmodelled, wandering, late, unfinished, model
+        work, stated, final, causes, verdict, unmodelled, wandering, late, unfinished, model
     )
 
 
@@ -233,7 +240,7 @@ def answer(
         held=tuple(work.held),
         remaining=work.remaining(final),
         findings=(
-            *told_small_faults(work, final), *shapes(final), *_outstanding(final),
+            *told_small_faults(work, final), *shapes(final, work.nominal), *_outstanding(final),
             *doubt, *(own_judges(work) if causes else ()), *final.train.warnings,
         ),
         unmodelled=unmodelled,

@@ -23,6 +23,7 @@ from cg_sysid.diagnosis.conclude import conclude
 from cg_sysid.diagnosis.doubt import exchange
 from cg_sysid.diagnosis.early_end import answer_so_far
 from cg_sysid.diagnosis.forward import extend
+from cg_sysid.diagnosis.free_shapes import drawn_otherwise
 from cg_sysid.diagnosis.landing_cause import with_landings
 from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.diagnosis.small_faults import less_small_faults
@@ -34,6 +35,7 @@ from cg_sysid.identification.kept_fits import kept_in
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.record import Record
 from cg_sysid.search import settings
+from cg_sysid.search.outcome import Outcome, chi2
 from cg_sysid.search.standings import left_undone
 from cg_sysid.search.task import Task
 from cg_sysid.stances.held_foot import held_by_friction
@@ -191,9 +193,14 @@ def search(work: Workspace) -> Diagnosis:
     Raises:
         IdentificationError: if the nominal model cannot be fitted.
     """
-    base = work.halving.fit([Task(work.nominal)], 'fitting the nominal model')[0]
-    if isinstance(base, Failure):
-        raise IdentificationError(base.reason)
+    drawn = drawn_otherwise(work)
+    models = [work.nominal] if drawn is None else [work.nominal, drawn]
+    stated, *other = work.halving.fit([Task(m) for m in models], 'fitting the nominal model')
+    if isinstance(stated, Failure):
+        raise IdentificationError(stated.reason)
+    base = stated
+    if other and isinstance(other[0], Outcome) and chi2(other[0]) < chi2(stated):
+        base = other[0]
     work.found = work.under_way = base
     try:
         final = extend(work, base)
@@ -210,6 +217,6 @@ def search(work: Workspace) -> Diagnosis:
         lean = ties_settled(work, base, fewer)
         if lean is not fewer:  # else nothing has changed since they were asked
             lean = less_small_faults(work, lean)
-        return conclude(work, base, lean)
+        return conclude(work, stated, base, lean)
     except OutOfTime:
-        return answer_so_far(work, base)
+        return answer_so_far(work, stated)

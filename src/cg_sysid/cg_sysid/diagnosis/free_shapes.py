@@ -11,8 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.effects.effect import Effect
+from cg_dynamics.model import Model
 from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.identification import torque_error
+from cg_sysid.identification.fit_result import Fit
 from cg_sysid.search import settings
+from cg_sysid.search.look import first_seconds
 from cg_sysid.search.model_selection import Comparison, above_noise, at_noise, settled
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.outcome import Outcome, chi2
@@ -21,6 +25,43 @@ from cg_sysid.search.starts import started_from
 from cg_sysid.search.task import Task
 
 PURE = 1e-3  # share of its range that a mixture may lie off an end of it, and count as pure
+
+
+def drawn_otherwise(work: Workspace) -> Model | None:
+    """The nominal model with its laws as the machine draws them, if that is not as stated.
+
+    Where friction turns otherwise than its law says, all that is tried leaves as much, and no race
+    is decided. Shapes that may be anything follow whatever is missing; so few do not. All joints
+    are drawn alike, as bearings of one kind are. On a robot only, where looks led by torques are
+    as cheap as they are near.
+    """
+    nominal = work.nominal
+    if not torque_error.can(nominal):
+        return None
+    kinds = {effect.name: effect for effect in nominal.effects if effect.drawings}
+    models = [nominal]
+    for name, kind in kinds.items():
+        alike = [effect for effect in nominal.effects if effect.name == name]
+        for drawing in kind.drawings:
+            values = {f'{e.label}.{p}': value for e in alike for p, value in drawing.items()}
+            if any(nominal.values[full] != value for full, value in values.items()):
+                models.append(nominal.with_values(values))
+    if len(models) == 1:
+        return None
+    arguments = [(Task(model), work.train) for model in models]
+    looks = work.carry_out(first_seconds, arguments, 'how the machine draws laws')
+    stated, *others = looks
+    if stated is None:
+        return None
+    same_seconds = [
+        (look, model) for look, model in zip(others, models[1:], strict=True)
+        if isinstance(look, Fit) and look.horizon == stated.horizon
+    ]  # fmt: skip
+    best, model = min(
+        same_seconds, key=lambda pair: pair[0].normalised_error, default=(stated, nominal)
+    )
+    clear = settings.SCREENING.same * best.normalised_error < stated.normalised_error
+    return model if clear else None
 
 
 def compared_with_free_shapes(work: Workspace, comparison: Comparison) -> Comparison:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.model import Model
 from cg_sysid.diagnosis.comparing import alone, compare, effects_on, refitted, worth_a_look
 from cg_sysid.diagnosis.free_shapes import (
     explained_by_own_shapes,
@@ -169,7 +170,7 @@ def beside_one_joint(work: Workspace, plain: Outcome, faulty: Outcome) -> Effect
     """
     if not at_noise(faulty):
         return []
-    off = {name.rpartition('.')[0] for name in shapes_off(faulty)}
+    off = {name.rpartition('.')[0] for name in shapes_off(faulty, plain.model)}
     places = {effect.at for effect in faulty.model.effects if effect.label in off}
     return [
         (name, at) for name, at in effects_on(work, plain)
@@ -272,24 +273,30 @@ def small_faults_of(o: Outcome) -> list[str]:
     return found
 
 
-def shapes(o: Outcome) -> list[str]:
-    """Laws that have another shape than the model states, in words."""
+def shapes(o: Outcome, stated: Model) -> list[str]:
+    """Laws that have another shape than a model states, in words."""
     return [
-        f'{name} = {measured(value, sigma, unit)} and not {measured(stated, None, unit)}: '
+        f'{name} = {measured(value, sigma, unit)} and not {measured(said, None, unit)}: '
         'the shape of a law, which texts and machines draw differently'
-        for name, (value, sigma, stated, unit) in shapes_off(o).items()
+        for name, (value, sigma, said, unit) in shapes_off(o, stated).items()
     ]
 
 
-def shapes_off(o: Outcome) -> dict[str, tuple[float, float, float, str]]:
-    """The same: full name -> (value, standard deviation, what the model states, unit)."""
-    found = {}
+def shapes_off(o: Outcome, stated: Model) -> dict[str, tuple[float, float | None, float, str]]:
+    """The same: full name -> (value, standard deviation if fitted, what is stated, unit)."""
+    said = stated.values
+    found: dict[str, tuple[float, float | None, float, str]] = {}
+    for name, declared in o.model.declarations.items():
+        value = o.model.values[name]
+        if declared.leeway and name not in o.task.bounds and value != said.get(name, value):
+            found[name] = value, None, said[name], declared.unit
     for u, v, s in zip(o.train.unknowns, o.train.values, o.train.sigmas, strict=True):
         if u.name not in o.task.bounds or not o.model.declarations[u.name].leeway:
             continue
-        off = abs(u.to_coordinate(v) - u.to_coordinate(u.prior))
+        usual = said.get(u.name, u.prior)
+        off = abs(u.to_coordinate(v) - u.to_coordinate(usual))
         if off > settings.DOUBT.shows * (s / v if u.logarithmic else s):
-            found[u.name] = float(v), float(s), u.prior, u.unit
+            found[u.name] = float(v), float(s), usual, u.unit
     return found
 
 
