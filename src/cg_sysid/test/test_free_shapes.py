@@ -2,17 +2,22 @@
 
 from dataclasses import replace
 
+import hanging_arm
 import numpy as np
 import pytest
 from searches import search_for
 
 from cg_dynamics.model import Model
+from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis import free_shapes, small_faults
 from cg_sysid.diagnosis.free_shapes import (
     compared_with_free_shapes,
     with_mixed_friction,
     with_shapes_of_causes,
 )
+from cg_sysid.diagnosis.result import Options
+from cg_sysid.diagnosis.workspace import Workspace
+from cg_sysid.identification.data_set import prepare
 from cg_sysid.search import settings
 from cg_sysid.search.model_selection import Comparison, settled
 from cg_sysid.search.nuisance import with_nuisances
@@ -203,3 +208,51 @@ def _told_by_its_usual_shape(work, nominal):
     plain = try_candidate(Task(model), work.train, work.held)
     wider, bounds = with_nuisances(model, work.setups())
     return plain, try_candidate(Task(wider, bounds=bounds), work.train, work.held)
+
+
+def _drawn_by(share, tails, mass):
+    """A machine that draws its friction so and carries a load, and a search on its records."""
+    nominal = hanging_arm.nominal()
+    drawn = {}
+    for joint in nominal.mechanism.driven:
+        drawn[f'coulomb_friction@{joint}.slow_share'] = share
+        drawn[f'coulomb_friction@{joint}.slow_tails'] = tails
+    load = {'mass': mass, 'x': 0.02, 'y': -0.03, 'z': -0.25}
+    machine = nominal.with_values(drawn).with_effect('payload', 'shank', **load)
+    records = [hanging_arm.recorded(machine, 6.0, seed) for seed in (3, 4)]
+    train, held = ([data_set] for data_set in prepare(nominal, records))
+    work = Workspace(nominal, train, held, Options(workers=1), lambda *_: None, None, Deadline())
+    return drawn, work
+
+
+DRAWINGS = pytest.mark.parametrize(
+    ('share', 'tails'), [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)], ids=['tanh', 'root', 'arctan']
+)
+
+
+@DRAWINGS
+def test_a_robots_friction_is_drawn_as_the_machine_draws_it_beside_a_load_it_does_not_know(
+    share, tails
+):
+    drawn, work = _drawn_by(share, tails, mass=0.2)
+    found = free_shapes.drawn_otherwise(work)
+    if not share:
+        assert found is None
+        return
+    assert {name: found.values[name] for name in drawn} == drawn
+    # It is told, though no fit has let it go.
+    told = small_faults.shapes(try_candidate(Task(found), work.train, work.held), work.nominal)
+    assert [line.split(':')[0] for line in told if 'slow_share' in line] == [
+        f'coulomb_friction@{joint}.slow_share = 1.000 and not 0'
+        for joint in work.nominal.mechanism.driven
+    ]
+
+
+@DRAWINGS
+def test_friction_is_drawn_as_stated_where_much_else_is_missing(share, tails):
+    # The load leaves 450 times the noise, whatever the friction.
+    assert free_shapes.drawn_otherwise(_drawn_by(share, tails, mass=0.35)[1]) is None
+
+
+def test_a_mechanism_of_a_few_joints_is_not_asked_how_it_draws_friction(search):
+    assert free_shapes.drawn_otherwise(search[0]) is None

@@ -60,7 +60,7 @@ def drawn_otherwise(work: Workspace) -> Model | None:
     best, model = min(
         same_seconds, key=lambda pair: pair[0].normalised_error, default=(stated, nominal)
     )
-    clear = settings.SCREENING.same * best.normalised_error < stated.normalised_error
+    clear = settings.SCREENING.drawn * best.normalised_error < stated.normalised_error
     return model if clear else None
 
 
