@@ -14,9 +14,8 @@ from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.identification import torque_error
-from cg_sysid.identification.fit_result import Fit
 from cg_sysid.search import settings
-from cg_sysid.search.look import first_seconds
+from cg_sysid.search.look import first_seconds, same_seconds
 from cg_sysid.search.model_selection import Comparison, above_noise, at_noise, settled
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.outcome import Outcome, chi2
@@ -39,29 +38,24 @@ def drawn_otherwise(work: Workspace) -> Model | None:
     if not torque_error.can(nominal):
         return None
     kinds = {effect.name: effect for effect in nominal.effects if effect.drawings}
-    models = [nominal]
+    models = []
     for name, kind in kinds.items():
         alike = [effect for effect in nominal.effects if effect.name == name]
         for drawing in kind.drawings:
             values = {f'{e.label}.{p}': value for e in alike for p, value in drawing.items()}
             if any(nominal.values[full] != value for full, value in values.items()):
                 models.append(nominal.with_values(values))
-    if len(models) == 1:
+    if not models:
         return None
-    arguments = [(Task(model), work.train) for model in models]
-    looks = work.carry_out(first_seconds, arguments, 'how the machine draws laws')
-    stated, *others = looks
-    if stated is None:
+    what = 'how the machine draws laws'
+    (stated,) = work.carry_out(first_seconds, [(Task(nominal), work.train)], what)
+    if stated is None or stated.normalised_error < settings.NOISE.settled:
         return None
-    same_seconds = [
-        (look, model) for look, model in zip(others, models[1:], strict=True)
-        if isinstance(look, Fit) and look.horizon == stated.horizon
-    ]  # fmt: skip
-    best, model = min(
-        same_seconds, key=lambda pair: pair[0].normalised_error, default=(stated, nominal)
-    )
-    clear = settings.SCREENING.drawn * best.normalised_error < stated.normalised_error
-    return model if clear else None
+    tasks = [(Task(model, first=stated), work.train) for model in models]
+    looks = zip(work.carry_out(same_seconds, tasks, what), models, strict=True)
+    found = [(look.normalised_error, model) for look, model in looks if look is not None]
+    error, drawn = min(found, key=lambda pair: pair[0], default=(np.inf, nominal))
+    return drawn if settings.SCREENING.drawn * error < stated.normalised_error else None
 
 
 def compared_with_free_shapes(work: Workspace, comparison: Comparison) -> Comparison:

@@ -114,6 +114,14 @@ def first_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
     return found
 
 
+def same_seconds(task: Task, train: Sequence[DataSet]) -> Fit | None:
+    """Fit of a task's model to those seconds that another was looked at (`task.first`), if any."""
+    try:
+        return _screened(task, task.model, train)
+    except (IdentificationError, DynamicsError, np.linalg.LinAlgError):
+        return None
+
+
 def deeper(task: Task, warm_start: Fit, train: Sequence[DataSet]) -> Fit | None:
     """Fit of a task's base to an excerpt from where an effect more has led its numbers.
 
