@@ -79,7 +79,7 @@ def with_events(work: Workspace, final: Outcome, cause: Cause) -> Cause:
         return cause
     shapes = {f'{cause.label}.{p.name}': p.leeway for p in parameters if p.leeway}
     task = replace(final.task, bounds={**final.task.bounds, **shapes})
-    found = fitted_to_all(work, replace(final, task=task))
+    (found,) = fitted_to_all(work, [replace(final, task=task)])
     if isinstance(found, Failure):
         log.info('%s on all records: %s', cause.label, found)
         return cause

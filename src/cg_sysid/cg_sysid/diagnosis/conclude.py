@@ -91,7 +91,7 @@ def from_all_records(work: Workspace, final: Outcome) -> Model | None:
     Errors are told of a fit that has not seen what judges it. Whoever simulates the machine wants
     what all of its records say.
     """
-    fitted = fitted_to_all(work, final, settings.FITTING.last_iterations)
+    (fitted,) = fitted_to_all(work, [final], settings.FITTING.last_iterations)
     if isinstance(fitted, Failure):
         log.info('no fit to all records: %s', fitted.reason)
         return None

@@ -1,5 +1,7 @@
 """Thorough fits: to the very bottom, in finer steps of integration."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 from cg_sysid.diagnosis.workspace import Workspace, structure
@@ -18,10 +20,15 @@ def thorough(work: Workspace, o: Outcome) -> Outcome:
 
     Thorough fits are compared only among themselves, or they would have the advantage.
     """
-    key = structure(o)
-    if key not in work.thorough:
-        work.thorough[key] = fitted_thoroughly(work, o)
-    return replace(work.thorough[key], label=o.label)
+    return all_thorough(work, [o])[0]
+
+
+def all_thorough(work: Workspace, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The same of several, side by side."""
+    new = {structure(o): o for o in outcomes if structure(o) not in work.thorough}
+    if new:
+        work.thorough |= zip(new, fitted_thoroughly(work, list(new.values())), strict=True)
+    return [replace(work.thorough[structure(o)], label=o.label) for o in outcomes]
 
 
 def finished(work: Workspace, o: Outcome) -> bool:
@@ -37,16 +44,24 @@ def finished(work: Workspace, o: Outcome) -> bool:
     )
 
 
-def fitted_thoroughly(work: Workspace, o: Outcome) -> Outcome:
-    """From where it stands, and from other minima of the same structure."""
+def fitted_thoroughly(work: Workspace, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Each from where it stands, and from other minima of the same structure."""
+    tasks = [_thorough_tasks(work, o) for o in outcomes]
+    title = f'thorough fits of {", ".join(title_of(work.added(o)) for o in outcomes)}'
+    fits = iter(work.halving.fit([task for own in tasks for task in own], title))
+    best = []
+    for o, own in zip(outcomes, tasks, strict=True):
+        found = [f for f in itertools.islice(fits, len(own)) if isinstance(f, Outcome)]
+        best.append(min([o, *found], key=chi2))
+    return best
+
+
+def _thorough_tasks(work: Workspace, o: Outcome) -> list[Task]:
     task = Task(o.model, events=o.events, bounds=o.task.bounds, thorough=True,
                 iterations=settings.FITTING.thorough_iterations)  # fmt: skip
     # Another minimum may have been sought with shapes let go that are not here.
     starts = (started_from(s.train, o.model, task.bounds) for s in other_minima(work, o))
-    tasks = [replace(task, warm_starts=(start,)) for start in (o.train, *starts)]
-    title = f'thorough fits of {title_of(work.added(o))}'
-    found = [fitted for fitted in work.halving.fit(tasks, title) if isinstance(fitted, Outcome)]
-    return min([o, *found], key=chi2)
+    return [replace(task, warm_starts=(start,)) for start in (o.train, *starts)]
 
 
 def other_minima(work: Workspace, o: Outcome) -> list[Outcome]:

@@ -1,8 +1,10 @@
 """Ties that thorough fits settle."""
 
+from collections.abc import Sequence
+
 from cg_sysid.diagnosis.doubt import without
 from cg_sysid.diagnosis.small_faults import shown
-from cg_sysid.diagnosis.thorough import thorough
+from cg_sysid.diagnosis.thorough import all_thorough
 from cg_sysid.diagnosis.workspace import Workspace, structure
 from cg_sysid.errors import Failure
 from cg_sysid.identification.fit_result import Fit
@@ -24,22 +26,22 @@ def tie(work: Workspace, comparison: Comparison, label: str) -> Comparison | Non
     ties = [pair[1] for name in close if (pair := comparison.of(name)) and at_noise(pair[1])]
     if len(ties) < 2 or ties[0].label != label:
         return None
-    outcomes = [thorough(work, o) for o in ties]
-    return work.selection.compare(
-        comparison.base, outcomes, [fitted_to_all(work, o) for o in outcomes]
-    )
+    outcomes = all_thorough(work, ties)
+    return work.selection.compare(comparison.base, outcomes, fitted_to_all(work, outcomes))
 
 
 def fitted_to_all(
-    work: Workspace, o: Outcome, iterations: int = settings.FITTING.thorough_iterations
-) -> Fit | Failure:
-    """A thorough fit of an outcome's structure to all records, or why there is none."""
-    key = structure(o)
-    if key not in work.joint:
-        title = f'{title_of(work.added(o))} on all records'
-        found = work.carry_out(fit_to_all, [(o, (*work.train, *work.held), iterations)], title)[0]
-        work.joint[key] = found
-    return work.joint[key]
+    work: Workspace,
+    outcomes: Sequence[Outcome],
+    iterations: int = settings.FITTING.thorough_iterations,
+) -> list[Fit | Failure]:
+    """Thorough fits of the structures of outcomes to all records, or why there are none."""
+    new = {structure(o): o for o in outcomes if structure(o) not in work.joint}
+    if new:
+        arguments = [(o, (*work.train, *work.held), iterations) for o in new.values()]
+        title = f'{", ".join(title_of(work.added(o)) for o in new.values())} on all records'
+        work.joint |= zip(new, work.carry_out(fit_to_all, arguments, title), strict=True)
+    return [work.joint[structure(o)] for o in outcomes]
 
 
 def ties_settled(work: Workspace, nominal: Outcome, final: Outcome) -> Outcome:

@@ -25,8 +25,8 @@ class Screening:
         following: Iterations of each of these on whole records, before the best of them is chosen.
         same: Ratio of the errors of two fits that may be one minimum.
         alike: Relative difference of an effect's parameters there.
-        drawn: Ratio of the errors of a model with its laws drawn in two ways, from which the better
-            one is the machine's. Where much is missing they differ by a few hundredths, either way.
+        drawn: Ratio of the errors of a model with its laws drawn in two ways, from which the
+            better is the machine's. Where much is missing they differ by hundredths, either way.
         clearly: Deviance (-2 log likelihood) of the torques by which what has states, as a rotor,
             is not simulated where it is worse than its rival, or waits where another is better.
     """
