@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from cg_bringup.hidden import hide, hideable_effects, perturb
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.checks.recordings import check_recording

@@ -35,8 +35,7 @@ import numpy as np
 import yaml
 
 from cg_bringup.hidden import draw_values, hidden_effects_file, hideable_effects, perturb
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import diagnose, split

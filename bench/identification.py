@@ -18,8 +18,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares, minimize
 
 from cg_bringup.hidden import perturb
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.assemble import parameter_vector
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model

@@ -19,8 +19,7 @@ import numpy as np
 from hidden_effects import SPRING_ERROR, errors_of, hide, records_of, with_small_faults
 
 from cg_bringup.hidden import hideable_effects
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.identification.data_set import led_in, prepare

@@ -18,8 +18,7 @@ import yaml
 from hidden_effects import PROGRAMME, SECONDS, hide, records_of
 
 from cg_bringup.hidden import hidden_effects_file
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.identification.data_set import prepare

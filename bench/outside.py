@@ -65,8 +65,7 @@ from hidden_effects import PROGRAMME, SECONDS, SPRING_ERROR, errors_of
 from mujoco_robot import Hidden, simulate_mujoco, two_links
 
 from cg_bringup.hidden import draw_values, hidden_effects_file
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid import parallel
 from cg_sysid.deadline import Deadline

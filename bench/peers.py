@@ -29,8 +29,7 @@ import numpy as np
 from hidden_effects import hide, records_of
 from peers import Answer, Case, NameCause
 
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import diagnose, split
 from cg_sysid.identification.data_set import LEAD_IN_S, prepare

@@ -46,8 +46,7 @@ def record(folder: Path, data: Path | None) -> None:
     from walking import walking
     from walking_records import as_record
 
-    from cg_bringup.runs import NOMINAL_MODEL
-    from cg_description.paths import model_path
+    from cg_description.paths import NOMINAL_MODEL, model_path
     from cg_dynamics.model import Model
 
     nominal = Model.load(model_path(NOMINAL_MODEL))

@@ -19,8 +19,7 @@ from pathlib import Path
 
 from hidden_effects import SPRING_ERROR, THE_SAME, hide, records_of, with_small_faults
 
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import split

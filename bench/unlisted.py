@@ -14,8 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Options

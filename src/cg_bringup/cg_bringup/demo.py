@@ -17,9 +17,9 @@ from rich.table import Table
 
 from cg_bringup.experiment import run_experiment
 from cg_bringup.hidden import Hidden, hide
-from cg_bringup.runs import NOMINAL_MODEL, Run
+from cg_bringup.runs import Run
 from cg_bringup.supervisor import Supervisor
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.stop_request import Stopped, stopped_by_signals
 from cg_interfaces.domains import own_domain

@@ -40,6 +40,7 @@ from cg_bringup.wired_experiment import EXPERIMENTER
 from cg_hardware.checklist.measuring import Heard, Track
 from cg_hardware.checklist.robot import Device, Hands, Quit, Refused, Skipped, Torque
 from cg_hardware.checklist.sensing import CHANNELS
+from cg_hardware.emulators.wires import HANDS
 from cg_interfaces import channels, topics
 from cg_interfaces.ros import (
     LATCHED_QOS,
@@ -65,7 +66,6 @@ BUTTONS = (
     '/imu/zero', '/imu/find_axis', '/drive/zero', '/drive/enable', '/drive/disable',
     '/safety_gate/arm', '/safety_gate/disarm', '/safety_gate/reset', '/safety_gate/stop',
 )  # fmt: skip
-HANDS = 'hands'  # pipe of the emulated robot, beside its IMU's line
 FOR_EXPERIMENTS = topics.IMU, topics.HIP_ENCODER, topics.DRIVE_ENABLED
 TYPES = {'/foot_contact/inner': WrenchStamped, '/foot_contact/outer': WrenchStamped, '/imu': Imu}
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cg_bringup import wired_experiment
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_bringup.wired_experiment import DEVICES, RecordedRobot, WiredExperiment, identities
-from cg_description.paths import model_path
+from cg_bringup.wired_experiment import RecordedRobot, WiredExperiment, identities
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_hardware.checklist import record
 from cg_hardware.checklist.plan import Plan
 from cg_hardware.checklist.robot import Refused, Robot
+from cg_hardware.checklist.sensing import DEVICES
 from cg_hardware.checklist.steps import NAMES, STEPS
 from cg_hardware.checklist.walk import FAILED, Result, walk
 from cg_hardware.simulation import read_setup

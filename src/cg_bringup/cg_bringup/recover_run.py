@@ -19,14 +19,14 @@ import yaml
 
 from cg_bringup.balance_run import MACHINE, carry_out
 from cg_bringup.balancing import FALLEN
-from cg_bringup.runs import CLOSING, MODES, NOMINAL_MODEL, PEERS, NodeOf
+from cg_bringup.runs import CLOSING, MODES, PEERS, NodeOf
 from cg_bringup.verdict import recovery_verdict
 from cg_control.grow_tree import BOX
 from cg_control.trees.growth import Region
 from cg_control.trees.preview import Preview
 from cg_control.trees.tree import Tree, TreeError
 from cg_control.trees.tree_files import tree_path
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_interfaces import topics

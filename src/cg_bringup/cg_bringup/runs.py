@@ -10,14 +10,13 @@ from typing import Any
 
 import yaml
 
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_interfaces import channels
 from cg_sysid.experiments.catalogue import Experiment, ExperimentError
 
 MODES = ('lockstep', 'real_time')  # of the simulated machine
 WIRED = 'wired'  # the machine is a real robot that is running
-NOMINAL_MODEL = 'compass_gait_mit'
 PATIENCE = 60.0  # s without progress; on a busy machine processes take that long to start
 PEERS = 45.0  # s by which the nodes of a run may start apart
 CHECKLISTS = Path('checklists')

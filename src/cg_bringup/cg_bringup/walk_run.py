@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 
 from cg_bringup.balance_run import MACHINE, carry_out
 from cg_bringup.recover_run import RecoverOptions, recover_nodes
-from cg_bringup.runs import MODES, NOMINAL_MODEL, NodeOf
+from cg_bringup.runs import MODES, NodeOf
 from cg_bringup.verdict import walk_verdict
 from cg_control.trees.tree import Tree, TreeError
 from cg_control.trees.tree_files import tree_path
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 

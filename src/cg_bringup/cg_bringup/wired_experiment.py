@@ -13,6 +13,7 @@ from cg_hardware.checklist import record
 from cg_hardware.checklist.measuring import Heard
 from cg_hardware.checklist.plan import STATED
 from cg_hardware.checklist.robot import Device, Refused, Robot
+from cg_hardware.checklist.sensing import DEVICES
 from cg_hardware.imu.mounting import STILL
 from cg_hardware.simulation import SOFTWARE
 from cg_sysid.experiments.catalogue import Experiment
@@ -24,7 +25,6 @@ RECORDER_S = 1.5  # s after which a recorder that hears everything has begun
 TAIL = 0.2  # s that are recorded after the torque
 EXPERIMENTER = 'experimenter: '  # before what it tells the person during an experiment
 LEAST_REST = 1.5  # s of diagnostics and measurements before anything is asked
-DEVICES = 'imu', 'drive'
 
 
 class RecordedRobot(Robot, Protocol):

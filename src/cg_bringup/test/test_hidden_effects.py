@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from cg_bringup.hidden import hide, perturb
-from cg_bringup.runs import NOMINAL_MODEL
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.cli.diagnose import main
 from cg_sysid.diagnosis.diagnose import diagnose

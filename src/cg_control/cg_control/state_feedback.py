@@ -30,7 +30,7 @@ from cg_control.answer_age import AnswerAges
 from cg_control.balancing.balance import WEIGHTS, BalanceSettings
 from cg_control.balancing.live_design import LiveDesign
 from cg_control.state_message import GAP_S, state_of
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_interfaces import topics
 from cg_interfaces.ros import (
@@ -41,8 +41,6 @@ from cg_interfaces.ros import (
     to_stamp,
 )
 from cg_interfaces.settings import setting
-
-NOMINAL_MODEL = 'compass_gait_mit'
 
 
 @dataclass(frozen=True)

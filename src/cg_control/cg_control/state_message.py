@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from cg_dynamics.rig import STANCES
+from cg_interfaces.channels import ROTOR
 
-ROTOR = 'hip_rotor'
 GAP_S = 0.02  # between states, after which the one before is history
 
 

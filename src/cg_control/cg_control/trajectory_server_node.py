@@ -22,13 +22,12 @@ from cg_control.following.planning import plan
 from cg_control.trajectories.collocation import Options
 from cg_control.trajectories.task import Task
 from cg_control.trajectories.trajectory import Trajectory
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run
 from cg_interfaces.settings import Settings, setting
 
-NOMINAL_MODEL = 'compass_gait_mit'
 PLANNED = {'inner_to_outer': ('inner', 'outer'), 'outer_to_inner': ('outer', 'inner')}
 
 

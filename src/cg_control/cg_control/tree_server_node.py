@@ -33,13 +33,12 @@ from cg_control.trees.tree import Tree
 from cg_control.trees.tree_files import TreeSelection, tree_path
 from cg_control.trees.tube_view import surface_segments, tube_segments
 from cg_control.trees.way_home import WayHome
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES
 from cg_interfaces.ros import LATCHED_QOS, SENSOR_QOS, DeclaredSettings, run
 from cg_interfaces.settings import Settings, setting
 
-NOMINAL_MODEL = 'compass_gait_mit'
 FRAME = 'world'
 WIDTH = 0.01  # m, of a line
 # (red, green, blue) of each line; the legs as in the URDF.

@@ -5,6 +5,8 @@ from pathlib import Path
 from cg_description.model_file import ModelFileError
 from cg_description.reading import path_of
 
+NOMINAL_MODEL = 'compass_gait_mit'  # where no model is named
+
 
 def models_directory() -> Path:
     """The directory of the model files: beside the sources, or in the share directory."""

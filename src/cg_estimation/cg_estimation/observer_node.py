@@ -17,7 +17,7 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_dynamics.rig import STANCES, Setup
 from cg_estimation.estimator import Estimate
@@ -35,10 +35,8 @@ from cg_interfaces.ros import (
 )
 from cg_interfaces.settings import setting
 
-NOMINAL_MODEL = 'compass_gait_mit'
 ROBOT = channels.mechanism('compass_gait')
 LOADED = 0.5  # N, or the 1 of a plain switch
-ROTOR = 'hip_rotor'
 NO_DRIVE = 1.0  # s after the first sample without a publisher of the applied torque
 REPEATED_START = 1_000_000_000  # ns behind the last stamp that mean a new run
 
@@ -75,7 +73,7 @@ class ObserverNode(Node):
         if rotors and rotors[0] in estimated:
             rotor = estimated.index(rotors[0])
             self._angles, self._rates = [0, 1, rotor], [2, 3, rotor + 1]
-        self.message = JointState(name=[*STANCES, ROTOR][: len(self._angles)])
+        self.message = JointState(name=[*STANCES, channels.ROTOR][: len(self._angles)])
         self._published = 0
         self._warn_stance = Throttled(self.get_logger().warning)
         self._warn_blind = Throttled(self.get_logger().warning)

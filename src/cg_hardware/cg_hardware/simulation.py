@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_description.reading import parse_yaml, path_of, read_text
 from cg_dynamics.model import Model
 from cg_dynamics.plant import Plant
@@ -16,7 +16,6 @@ from cg_dynamics.rig import Setup
 from cg_interfaces.settings import Settings, setting
 from cg_interfaces.stamps import NS_PER_S
 
-NOMINAL_MODEL = 'compass_gait_mit'
 SOFTWARE = 'compass-gait 0.2.0'
 CATCH_UP = 2.0  # simulated s per s that a late machine takes at most
 LOCKSTEP_EPOCH_NS = NS_PER_S  # simulated time starts at 1 s: a stamp of zero means "unset"

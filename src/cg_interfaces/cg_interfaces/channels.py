@@ -20,6 +20,8 @@ TRAJECTORY_STATE = 'control_msgs/msg/JointTrajectoryControllerState'
 IMU = 'sensor_msgs/msg/Imu'
 STRING = 'std_msgs/msg/String'
 
+ROTOR = 'hip_rotor'  # joint of /state behind the two legs, where the drive springs
+
 # Kind of a sensor of a joint -> field of the JointState that it fills.
 SENSOR_FIELDS = {'encoder': 'position', 'tachometer': 'velocity'}
 

@@ -152,6 +152,10 @@ def test_a_learned_function_that_hardly_varies_is_called_a_constant(nominal):
     for peak, words in ((0.15, 'where it is largest'), (0.0, 'anywhere')):
         unsure = replace(wave, shape=replace(wave.shape, peak=peak))
         assert f'0.21 N m RMS, its size not sure {words}. ' in unsure.text
+    # One place is not a stretch from itself to itself.
+    for stretch, words in (((0.81, 1.93), 'from 0.81 to 1.9 s'), ((0.808, 0.811), 'near 0.81 s')):
+        narrow = replace(wave, shape=replace(wave.shape, stretch=stretch))
+        assert f', mostly {words}, ' in narrow.text
 
 
 def test_a_spring_that_winds_up_by_turns_is_no_transmission(nominal):

@@ -57,7 +57,7 @@ from cg_dynamics.plant import Plant
 from cg_dynamics.rig import STANCES, Setup
 from cg_hardware.emulators.cia402_device import Cia402Device
 from cg_hardware.emulators.gx3_device import TIMER_HZ, Gx3Device, closed
-from cg_hardware.emulators.wires import Pty, SerialCan
+from cg_hardware.emulators.wires import HANDS, Pty, SerialCan
 from cg_hardware.simulation import read_setup
 from cg_interfaces.priority import take_priority
 
@@ -72,7 +72,6 @@ INDEX = 0.06  # rad of the hip at which the encoder has its index
 BY_HAND = 0.3  # rad/s at which a person turns the hip
 LEGS = ('q_inner', 'q_outer')
 FOOT_BITS = {'inner': 1 << 16, 'outer': 1 << 17}  # of the drive's inputs, a foot switch each
-HANDS = 'hands'  # pipe in the folder of the wires
 GIMBAL = (0.012, -0.7)  # rad: roll and yaw of an IMU that is mounted as people mount things
 FLOOR = 0.6  # rad from where it stood, from where a person picks it up
 HEARTBEAT = 0x77F  # of the host

@@ -8,6 +8,7 @@ from pathlib import Path
 
 FRAME = re.compile(rb't([0-9A-Fa-f]{3})([0-8])((?:[0-9A-Fa-f]{2})*)\Z')
 REMOTE = re.compile(rb'r([0-9A-Fa-f]{3})[0-8]\Z')
+HANDS = 'hands'  # name of the pipe, beside the wires, by which a person's hands are told
 LINE_LIMIT = 64  # bytes of a line; what is longer is garbage
 
 

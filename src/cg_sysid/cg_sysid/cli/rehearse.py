@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cg_description.paths import model_path
+from cg_description.paths import NOMINAL_MODEL, model_path
 from cg_dynamics.model import Model
 from cg_sysid.cli import common as cli
 from cg_sysid.experiments.catalogue import (
@@ -29,7 +29,6 @@ from cg_sysid.provenance import software
 from cg_sysid.records.bag_writer import write_bag
 from cg_sysid.records.record import Record
 
-NOMINAL_MODEL = 'compass_gait_mit'
 JOINT_SEEDS = 1000  # between the excitations of the joints of one machine, as in excitation_node
 ZEROED_AT = '1970-01-01T00:00:00Z'  # simulated time begins then
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from cg_interfaces.stamps import NS_PER_S
+from cg_sysid.experiments.synthetic import START_NS
 from cg_sysid.records.raw import RawRecording, RawTopic
 from cg_sysid.records.record import Record
 
-START_NS = 1_300_000_000 * NS_PER_S
 ARRIVAL_S = 1e-4  # scale of the delays between stamp and arrival
 ALL = 'all'
 

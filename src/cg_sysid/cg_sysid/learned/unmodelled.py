@@ -106,7 +106,8 @@ class Unmodelled:
         if shape.stretch is not None:
             factor, unit = scaled(max(map(abs, shape.stretch)), self.variable_unit)
             low, high = (number(factor * end, 2) for end in shape.stretch)
-            found.append(f'mostly from {low} to {high} {unit}')
+            where = f'from {low} to {high}' if low != high else f'near {low}'
+            found.append(f'mostly {where} {unit}')
         peak = f' and {_quantity(shape.peak, self.effect.unit)} at most'
         if shape.peak < shape.rms:
             where = 'where it is largest' if shape.peak else 'anywhere'

@@ -22,8 +22,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-MAGIC = b'\x89MCAP0\r\n'
-HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x01, 0x03, 0x04, 0x05, 0x06
+from cg_sysid.records.mcap_records import CHANNEL, CHUNK, HEADER, MAGIC, MESSAGE, SCHEMA
+
 # opcode, length, start and end time, size, CRC, length of compression (none), length of records
 CHUNK_HEAD = struct.Struct('<BQQQQIIQ')
 CHUNK_HEAD_LENGTH = CHUNK_HEAD.size - 9  # of the content

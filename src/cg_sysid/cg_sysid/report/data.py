@@ -1,10 +1,8 @@
 """Last part of the page: recordings, their quality, and where everything comes from."""
 
 from cg_sysid.report.markup import Markup, column, row, tag, wide
-from cg_sysid.report.wording import Facts, input_units, setup_words
+from cg_sysid.report.wording import ROLES, Facts, input_units, setup_words
 from cg_sysid.text import effect_name, listed, number, plain_unit, scaled, sentence
-
-ROLES = {'held': 'held out', 'train': 'fitted', 'all': 'fitted'}
 
 
 def recordings(facts: Facts) -> Markup | None:

@@ -1,10 +1,9 @@
 """Second part of the page: measured against simulated, and what is left over."""
 
 from cg_sysid.report.markup import Markup, tag
-from cg_sysid.report.wording import Facts, best_channel, setup_words, worst_channel
+from cg_sysid.report.wording import ROLES, Facts, best_channel, setup_words, worst_channel
 
 HINT = 'Drag to zoom, double-click for the whole record.'
-ROLES = {'held': 'held out', 'train': 'fitted', 'all': 'fitted'}
 
 
 def compares(facts: Facts) -> bool:

@@ -16,6 +16,7 @@ VERDICTS = {
     'unusable': 'The recordings themselves are broken.',
     'identified': 'Parameters of the model as given, fitted to the recordings.',
 }
+ROLES = {'held': 'held out', 'train': 'fitted', 'all': 'fitted'}  # of a recording
 MAINLY = 0.5  # of the squared error: a learned term that takes less makes no headline
 MOST_EVENTS = 12  # values of single recordings that are listed
 ABOVE_NOISE = 2.0  # multiples of the sensor noise from which an error is spoken of
