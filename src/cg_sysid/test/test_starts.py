@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cg_dynamics.assemble import parameter_vector
+from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import START_TORQUE
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup, Spring
@@ -66,6 +67,15 @@ def test_steps_of_a_drive_are_found_beside_the_torque(model_file, step):
     found = own_parameters(try_candidate(look.task, train, held))['step']
     # Half a step more or less for the largest torque would be off by 4 %.
     assert found[0] == pytest.approx(step, rel=5e-3)
+
+
+def test_no_step_of_a_drive_lies_far_from_where_a_fit_sets_out(model_file):
+    drive = LIBRARY['torque_quantisation'](Model.load(model_file).mechanism)
+    within = [15.75 / start['step'] for start in drive.starts_beside(15.75)]
+    # A step of 0.414 N m, 38 within that torque, was out of reach of starts that ended at 20.
+    assert (min(within), max(within)) == (pytest.approx(2), pytest.approx(40))
+    # Where an edge is off by half a step the response to it has lost its sign.
+    assert np.diff(within) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize('phase', [4.4, -4.0, 0.7])

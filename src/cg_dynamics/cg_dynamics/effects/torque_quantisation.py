@@ -42,8 +42,8 @@ class TorqueQuantisation(Effect):
         return [{'step': period}]
 
     def starts_beside(self, torque):
-        """From two steps within that torque to 20: half a step more leaves the edges elsewhere."""
-        return [{'step': 2 * torque / n} for n in range(4, 41)]
+        """From two steps within that torque to 40: half a step more leaves the edges elsewhere."""
+        return [{'step': 2 * torque / n} for n in range(4, 81)]
 
     def deliver(self, torque, z, p):
         """(STEPS)."""
