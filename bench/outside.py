@@ -2,6 +2,7 @@
 
     ./cg exec python bench/outside.py                          the whole programme, 190 cases
     ./cg exec python bench/outside.py --sample 60              of every kind its share, drawn once
+    ./cg exec python bench/outside.py --sample 60 --after 28   the others of these
     ./cg exec python bench/outside.py --case single:17         one of them, in words
     ./cg exec python bench/outside.py --table-only --write bench/results/outside.md
 
@@ -479,6 +480,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--case', help='KIND:NUMBER, run and told in words')
     parser.add_argument('--sample', type=int, help='so many of all cases')
+    parser.add_argument('--after', type=int, default=0, help='less so many of the sample [0]')
     parser.add_argument(
         '--cores', type=int, default=os.cpu_count() or 1,
         help='of a case, as many cases side by side as there are cores for [all]',
@@ -498,7 +500,7 @@ def main() -> int:
         row = run(wanted[0], version, options.limit, options.cores)
         print(json.dumps(row, indent=1), 'right' if is_right(row) else 'wrong', sep='\n')
         return 0
-    chosen = sampled(cases, options.sample) if options.sample else cases
+    chosen = sampled(cases, options.sample or len(cases))[options.after :]
     rows = known_rows(options.raw, None if options.table_only else version)
     if not options.table_only:
         rows = with_missing(
@@ -516,6 +518,7 @@ def main() -> int:
         what = ', '.join(f'{n} {kind}' for kind, n in count.items())
         drawn = f', {len(made)} of them run' if len(made) < len(cases) else ''
         sample = f' --sample {options.sample}' if options.sample else ''
+        sample += f' --after {options.after}' if options.after else ''
         options.write.write_text('\n'.join([
             '# Machines that share no code with the models', '',
             f'Command: `./cg exec python bench/outside.py{sample} --cores '
