@@ -277,3 +277,25 @@ def test_an_answer_before_the_end_has_the_small_faults_that_were_found(raced, se
     with pytest.raises(OutOfTime):
         forward.extend(work, search[1])
     assert work.found is lean
+
+
+def test_what_later_causes_have_left_nothing_of_goes_without_a_race(search, monkeypatch):
+    work, base, _, _ = search
+    train, held = work.train, work.held
+    own = try_candidate(Task(base.model, (OWN, None), iterations=60), train, held)
+    final = try_candidate(Task(own.model, ('torque_constant', None), iterations=60), train, held)
+    monkeypatch.setattr(work, 'comparisons', {})
+    monkeypatch.setattr(doubt, 'compare', lambda *_: pytest.fail('the library raced'))
+    fitted = []
+
+    def fit(tasks, what):
+        fitted.extend(tasks)
+        return [own]
+
+    monkeypatch.setattr(work.halving, 'fit', fit)
+    gone = doubt.without(work, base, final, 'torque_constant')
+    assert gone.base is own
+    assert gone.winner() is None
+    # The bias sets out from where it is, not from none.
+    ((start,),) = (task.warm_starts for task in fitted)
+    assert start.numbers[f'{OWN}.bias'] == pytest.approx(0.8, abs=0.05)

@@ -7,9 +7,10 @@ from cg_sysid.diagnosis.comparing import compare, effects_on
 from cg_sysid.diagnosis.small_faults import with_law
 from cg_sysid.diagnosis.workspace import Workspace
 from cg_sysid.errors import Failure
+from cg_sysid.search import settings
 from cg_sysid.search.model_selection import Comparison
 from cg_sysid.search.nuisance import with_nuisances
-from cg_sysid.search.outcome import Outcome, chi2
+from cg_sysid.search.outcome import Outcome, chi2, too_small
 from cg_sysid.search.ranking import contains
 from cg_sysid.search.starts import started_from
 from cg_sysid.search.successive_halving import Effects
@@ -48,8 +49,13 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
         if bounds:
             model, missing = with_nuisances(model, work.setups())
             bounds = {**bounds, **missing}
-        task = Task(model, events=final.events, bounds=bounds)
-        if bounds and others in work.faulty:
+        # Without what is earned it cannot come near: no valley of it is walked to its end.
+        reach = settings.HALVING.in_reach * max(final.train.normalised_error, 1.0)
+        task = Task(model, events=final.events, bounds=bounds, reach=reach)
+        if too_small(replace(final, label=label)):
+            # Without what is as good as none all other numbers stay where they are.
+            task = replace(task, warm_starts=(started_from(final.train, model, bounds),))
+        elif bounds and others in work.faulty:
             task = replace(
                 task, warm_starts=(started_from(work.faulty[others].train, model, bounds),)
             )
@@ -58,6 +64,10 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
         if isinstance(lean, Failure):
             log.info('without %s: %s', label, lean)
             return None
+        # What later causes have left nothing of needs no rival: the search goes on without it.
+        alone = work.selection.compare(lean, [replace(final, label=label)])
+        if alone.ranked[0][0].evidence < settings.SELECTION.earned:
+            return alone
         # Who would take the place has to come up to what is there.
         compare(work, lean, with_law(work, final), outrun(work, lean, label))
     comparison = work.comparisons[key]
