@@ -47,6 +47,11 @@ def test_what_json_writes_comes_back():
     assert parse_json(json.dumps(tree, ensure_ascii=False, indent=1), 'x') == tree
 
 
+def short(words):
+    """The name of a case in reports."""
+    return words[:30]
+
+
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
@@ -65,6 +70,7 @@ def test_what_json_writes_comes_back():
         ('a: "\\U7FFFFFFF"', 'not YAML'),
         ('a: \x00', 'not YAML: the character 0x00'),
     ],
+    ids=short,
 )
 def test_what_is_no_plain_yaml_is_refused(text, message):
     with pytest.raises(DocumentError, match=message) as caught:
@@ -83,6 +89,7 @@ def test_what_is_no_plain_yaml_is_refused(text, message):
         ('"' + '\\"' * 50_000, 'not JSON'),
         ('[' + '[],' * 400_000 + '1]', 'more than 300000 values'),
     ],
+    ids=short,
 )
 def test_what_is_no_plain_json_is_refused(text, message):
     began = time.process_time()
