@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import assemble, overrides, parameter_vector
+from cg_dynamics.assemble import Equations, assemble, overrides, parameter_vector
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.mechanisms.urdf import Urdf
@@ -470,45 +470,65 @@ def _columns(
     for other in model.effects:
         if other.label != effect.label and other.site == effect.site and not other.states:
             bare = bare.with_effect(other.name, other.at, **model.values_of(other))
-    found = []
-    for start in starts_of(effect):
-        acting = bare.with_effect(name, at, **start)
-        columns = [
-            _one_column(acting, effect.label, problem, motion)
-            for problem, motion in zip(problems, by_motion, strict=True)
-        ]
-        found.append(np.concatenate(columns))
-    return found
+    from_starts = [bare.with_effect(name, at, **start) for start in starts_of(effect)]
+    found = [
+        _from_starts(from_starts, effect.label, problem, motion)
+        for problem, motion in zip(problems, by_motion, strict=True)
+    ]
+    return [np.concatenate(columns) for columns in zip(*found, strict=True)]
 
 
-def _one_column(model: Model, label: str, problem: Problem, by_motion: np.ndarray) -> np.ndarray:
-    """D for the motions of one set-up."""
-    motion: Motion = problem.motion
+def _from_starts(
+    models: Sequence[Model], label: str, problem: Problem, by_motion: np.ndarray
+) -> list[np.ndarray]:
+    """D for the motions of one set-up, from each start of an effect: in the same equations."""
+    model, motion = models[0], problem.motion
     e = assemble(model, motion.setup)
-    p = parameter_vector(model, motion.setup)
     own = [
         k for k, n in enumerate(e.parameter_names)
         if n.startswith(f'{label}.') and model.declarations[n].free
     ]  # fmt: skip
+    f = _by_parameters(e, own, sensed=e.coordinates == len(model.mechanism.coordinates))
+    return [
+        _one_column(f, parameter_vector(start, motion.setup), problem, by_motion)
+        for start in models
+    ]
+
+
+def _by_parameters(e: Equations, own: Sequence[int], *, sensed: bool) -> ca.Function:
+    """Derivatives by some parameters of forces, of what the sensors show, and of delays.
+
+    Args:
+        e: Of a robot without bodies.
+        own: Places of the parameters.
+        sensed: Each coordinate has its sensor.
+    """
     moved = ca.vertcat(*(e.p[k] for k in own))
     m = e.coordinates
     s, ds, a = e.x[:m], e.x[m : 2 * m], e.acceleration
-    seen = e.outputs[:m] - s if m == len(model.mechanism.coordinates) else ca.SX.zeros(m)
+    seen = e.outputs[:m] - s if sensed else ca.SX.zeros(m)
     seen_rate = ca.jtimes(seen, s, ds)
     seen_acceleration = ca.jtimes(seen_rate, s, ds) + ca.jtimes(seen_rate, ds, a)
     # A sensor that shows more than there is: what is there is less than measured.
     shown = -ca.jacobian(ca.vertcat(seen, seen_rate, seen_acceleration), moved)
     late = ca.jacobian(ca.vertcat(e.input_delay, e.output_delays[:m]), moved)
-    f = ca.Function(
+    return ca.Function(
         'columns', [e.x, e.u, a, e.p],
         [ca.densify(x) for x in (ca.jacobian(e.imbalance, moved), shown, late)],
     )  # fmt: skip
-    k = len(motion.position)
+
+
+def _one_column(
+    f: ca.Function, p: np.ndarray, problem: Problem, by_motion: np.ndarray
+) -> np.ndarray:
+    """D for the motions of one set-up, from one start, (rows, m, numbers)."""
+    motion: Motion = problem.motion
+    k, count = len(motion.position), f.size2_out(0)
     x = np.hstack([motion.position, motion.rate]).T
-    u = motion.inputs[:, : e.u.shape[0]].T
+    u = motion.inputs[:, : f.size1_in(1)].T
     force, readings, delays = f.map(k)(x, u, motion.acceleration.T, p)
     force, readings, delays = (
-        np.asarray(part).reshape(part.shape[0], k, len(own)).transpose(1, 0, 2)
+        np.asarray(part).reshape(part.shape[0], k, count).transpose(1, 0, 2)
         for part in (force, readings, delays)
     )
     found = force + np.einsum('kij,kjc->kic', by_motion, readings)
