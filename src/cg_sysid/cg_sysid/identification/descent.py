@@ -31,6 +31,7 @@ HALF = 0.5  # share that a step takes off a positive value, before it takes less
 DAMPING, LEAST_DAMPING = 1e-3, 1e-13  # of the first step, and of any
 ALONG = 0.1  # of what is still to be gained: a step that gains less has met the floor of a valley
 LEAP = 1e3  # ratio of its damping to that of the next, as long as no step was too long
+ALIKE = 0.5  # ratio from which one damping is no less than another: it changes by factors of ten
 SHORT = 0.5  # damping from which a step is short
 
 
@@ -141,6 +142,7 @@ class _Way:
         assert point is not None
         self._here, self._theta, self._motions, self._damping = start, theta, motions, damping
         self._too_long = False  # whether a step was
+        self._little_at = np.inf  # damping of the last step, if that gained little
         self._began, self.errors = float(point.cost), [error_of(point)]
         # The border's weight follows what is still to be gained (a central path): whoever meets
         # the border early creeps along it ever after.
@@ -195,11 +197,15 @@ class _Way:
         promised = _promised(there, self._frozen(self._theta, there))
         # Most of what is to be gained lies along the floor, where damped steps do not go.
         leap = self._valley is FAR and gain < ALONG * promised and not self._too_long
+        taken_at = self._damping
         self._damping = max(self._damping / (LEAP if leap else 10), LEAST_DAMPING)
         small = max(drift * there.cost, SMALL_GAIN)
         little = gain < small and self._barrier <= max(BARRIER, CENTRAL * small)
-        # A short step gains little too.
-        if little and promised < small:
+        # A short step gains little too; but where a longer one has failed since the last, none
+        # keeps what the equations promise.
+        stuck = taken_at > ALIKE * self._little_at
+        self._little_at = taken_at if little else np.inf
+        if little and (promised < small or stuck):
             return True
         lower = max(BARRIER, min(self._barrier, CENTRAL * gain))
         self._point, self._barrier = there.beside(self._barrier, lower), lower
