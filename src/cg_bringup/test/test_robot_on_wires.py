@@ -37,7 +37,8 @@ pytestmark = [pytest.mark.alone, pytest.mark.slow]
 AT_MOST = 0.02  # s from a fault to zero torque at the drive
 SPREAD = 0.01  # s: the instant of a fault is known from outside by reports of the emulation
 STARTS = 5  # of a robot that shall balance
-PUSHES = 3  # of which it withstands one, on whatever host
+# Of which it withstands one, on whatever host; on one that is known to keep time, the first.
+PUSHES = 1 if 'CG_NO_EXCUSE' in os.environ else 3
 HELD_UP = 0.01  # s by which a host may hold the emulation up for deadlines to mean anything
 
 

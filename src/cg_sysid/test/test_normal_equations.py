@@ -1,5 +1,7 @@
 """The step of an identification, from normal equations of very different size."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hanging_arm import nominal, recorded
@@ -221,3 +223,41 @@ def test_far_from_the_noise_a_fit_loses_little_by_seeking_no_floor_of_a_valley(
     to_the_floor = fit(believed, data_sets)
     # A thousandth of the cost in each of the last steps: a few per cent in all.
     assert found.normalised_error < 1.05 * to_the_floor.normalised_error
+
+
+class _Creeping:
+    """A trial that is its own point: a promise of 50, of which each step keeps next to nothing."""
+
+    theta, motions, count = np.zeros(0), (), np.ones(1)
+
+    def __init__(self, cost):
+        self.cost = cost
+        self.sse = np.array([cost])
+
+    def point(self, weight):
+        return self
+
+    def beside(self, before, barrier):
+        return self
+
+
+@pytest.mark.parametrize(('shortest', 'steps', 'ends'), [(1e-3, 3, True), (0.0, 3, None)])
+def test_where_only_short_steps_gain_and_little_is_a_minimum(monkeypatch, shortest, steps, ends):
+    """Where longer ones gain as well it goes on: that short ones gain little says nothing."""
+    monkeypatch.setattr(descent, '_promised', lambda *_: 50.0)
+    monkeypatch.setattr(descent, 'settled', lambda trial, *_: trial)
+    monkeypatch.setattr(descent._Way, '_frozen', lambda *_: np.zeros(0, bool))
+    problem = SimpleNamespace(unknowns=())
+    way = descent._Way(problem, 1.0, 1.0, False, descent.NEAR, np.zeros(0, bool), _Creeping(1e3),
+                       np.zeros(0), [], 1e-3)  # fmt: skip
+    way._barrier = 0.0
+    gain = 0.5 * descent.SMALL_GAIN
+
+    def ahead(theta, motions, point, damping):
+        return _Creeping(point.cost + (1.0 if damping < shortest / 2 else -gain))
+
+    monkeypatch.setattr(way, '_ahead', ahead)
+    monkeypatch.setattr(way, '_back', lambda trial: trial)
+    monkeypatch.setattr(way, '_cost', lambda trial: trial.cost)
+    monkeypatch.setattr(way, '_normal', lambda trial: trial)
+    assert [way.step(0.0) for _ in range(steps)] == [None] * (steps - 1) + [ends]

@@ -45,21 +45,8 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
     others = work.added(final) - {label}
     key = others, bool(final.task.bounds)
     if key not in work.comparisons:
-        model, bounds = final.model.without_effect(label), final.task.bounds
-        if bounds:
-            model, missing = with_nuisances(model, work.setups())
-            bounds = {**bounds, **missing}
-        # Without what is earned it cannot come near: no valley of it is walked to its end.
-        reach = settings.HALVING.in_reach * max(final.train.normalised_error, 1.0)
-        task = Task(model, events=final.events, bounds=bounds, reach=reach)
-        if too_small(replace(final, label=label)):
-            # Without what is as good as none all other numbers stay where they are.
-            task = replace(task, warm_starts=(started_from(final.train, model, bounds),))
-        elif bounds and others in work.faulty:
-            task = replace(
-                task, warm_starts=(started_from(work.faulty[others].train, model, bounds),)
-            )
-        known = not others and not bounds
+        task = _lean(work, final, label)
+        known = not others and not task.bounds
         lean = nominal if known else work.halving.fit([task], f'model without {label}')[0]
         if isinstance(lean, Failure):
             log.info('without %s: %s', label, lean)
@@ -78,6 +65,24 @@ def without(work: Workspace, nominal: Outcome, final: Outcome, label: str) -> Co
         again = work.selection.compare(comparison.base, [*outcomes, replace(final, label=label)])
         comparison = work.comparisons[key] = replace(again, aside=comparison.aside)
     return comparison
+
+
+def _lean(work: Workspace, final: Outcome, label: str) -> Task:
+    """The model without one of its effects, as a task."""
+    model, bounds = final.model.without_effect(label), final.task.bounds
+    if bounds:
+        model, missing = with_nuisances(model, work.setups())
+        bounds = {**bounds, **missing}
+    if too_small(replace(final, label=label)):
+        known = final  # without what is as good as none all other numbers stay where they are
+    else:
+        known = work.faulty.get(work.added(final) - {label}) if bounds else None
+    return Task(
+        model, events=final.events, bounds=bounds,
+        warm_starts=(started_from(known.train, model, bounds),) if known else (),
+        # Without what is earned it cannot come near: no valley of it is walked to its end.
+        reach=settings.HALVING.in_reach * max(final.train.normalised_error, 1.0),
+    )  # fmt: skip
 
 
 def outrun(work: Workspace, lean: Outcome, label: str) -> Effects:
