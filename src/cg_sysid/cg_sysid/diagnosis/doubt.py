@@ -74,9 +74,8 @@ def _lean(work: Workspace, final: Outcome, label: str) -> Task:
         model, missing = with_nuisances(model, work.setups())
         bounds = {**bounds, **missing}
     if too_small(replace(final, label=label)):
-        known: Outcome | None = (
-            final  # without what is as good as none all other numbers stay where they are
-        )
+        # Without what is as good as none all other numbers stay where they are.
+        known: Outcome | None = final
     else:
         known = work.faulty.get(work.added(final) - {label}) if bounds else None
     return Task(
