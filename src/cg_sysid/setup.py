@@ -17,6 +17,7 @@ PROGRAMS = [
     'import = cg_sysid.records.importing:main',
     'check = cg_sysid.checks.recordings:main',
     'identify = cg_sysid.cli.identify:main',
+    'torques = cg_sysid.cli.torques:main',
     'diagnose = cg_sysid.cli.diagnose:main',
     'report = cg_sysid.cli.report:main',
     'rehearse = cg_sysid.cli.rehearse:main',

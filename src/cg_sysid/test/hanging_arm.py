@@ -57,13 +57,17 @@ def recorded(model: Model, seconds: float, seed: int, setup: Setup = Setup()) ->
     grown = 1 - np.exp(-4 * time[:, None] ** 2)
     ways = grown * 0.3 * np.sin(w * time[:, None, None] + phase).sum(axis=2)
     rates = np.gradient(ways, SAMPLE, axis=0)
-    x = compiled.initial_state(np.zeros(2 * n), np.zeros(compiled.nu), p)
+    kinematics = model.mechanism.kinematics(setup)  # joints that are locked do not move
+    basis, m = np.asarray(kinematics.basis), len(kinematics.names)
+    offset = np.broadcast_to(np.asarray(kinematics.offset).ravel(), n)
+    x = compiled.initial_state(np.zeros(2 * m), np.zeros(compiled.nu), p)
     states, torques = np.zeros((len(time), compiled.nx)), np.zeros((len(time), compiled.nu))
     if TIME in compiled.input_names:
         torques[:, compiled.input_names.index(TIME)] = time
     for k in range(len(time)):
         states[k] = x
-        torques[k, :n] = 60 * (ways[k] - x[:n]) + 3 * (rates[k] - x[n : 2 * n])
+        position, rate = basis @ x[:m] + offset, basis @ x[m : 2 * m]
+        torques[k, :n] = 60 * (ways[k] - position) + 3 * (rates[k] - rate)
         compiled.advance(x, torques[k], p, SAMPLE / 4, 4)
     seen = compiled.outputs(time, torques, states, p)
     seen = seen + NOISE * random.standard_normal(seen.shape)

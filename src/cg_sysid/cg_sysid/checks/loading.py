@@ -110,6 +110,7 @@ def load_bags(
     window: float | None = None,
     progress: Progress = lambda what, done, total: None,
     use_anyway: Iterable[str] = (),
+    whole: bool = False,
 ) -> Loaded:
     """Read and check bags; broken ones are left out, with the reason.
 
@@ -122,6 +123,7 @@ def load_bags(
         window: Cut records into windows of this length in s instead.
         progress: Called with (what, done, total).
         use_anyway: Names of findings by which no bag is left out, as in `check_recording`.
+        whole: Leave records whole that nobody has asked to cut, as for what simulates nothing.
 
     Raises:
         ValueError: `use_anyway` names what cannot be overruled.
@@ -149,7 +151,7 @@ def load_bags(
     if model is not None:
         require_same_robot(model, records)
     cut = cut_steps(records, model)
-    windows = _followed(model, cut.records, window)
+    windows = _followed(None if whole else model, cut.records, window)
     pieces: list[Record] = []
     wholes: list[Record] = []
     for record, found in zip(cut.records, windows.records, strict=True):

@@ -40,6 +40,7 @@ COMMANDS = {
         'checks.recordings', 'say what is wrong with recordings before anything is fitted'
     ),
     'identify': Command('cli.identify', 'find the numbers of a model from recordings'),
+    'torques': Command('cli.torques', 'say which laws the torques of a robot lack, in a minute'),
     'diagnose': Command('cli.diagnose', 'say what a model gets wrong about recordings, and why'),
     'report': Command('cli.report', 'draw the report of a result again'),
     'frequency-response': Command(

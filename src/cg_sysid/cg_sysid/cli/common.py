@@ -1,6 +1,7 @@
 """What the command lines share: one-line errors, options, tables."""
 
 import argparse
+import fnmatch
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.model import Model
 from cg_sysid import parallel
+from cg_sysid.checks.loading import Loaded
 from cg_sysid.checks.recordings import use_anyway_option
 from cg_sysid.deadline import OutOfTime
 from cg_sysid.records import bags
@@ -72,10 +76,6 @@ def common_options(parser: argparse.ArgumentParser) -> None:
         help='directory for the results; files of an earlier run in it are replaced',
     )  # fmt: skip
     parser.add_argument(
-        '--window', type=float, metavar='SECONDS',
-        help='cut every record into windows [only where the whole cannot be followed]',
-    )  # fmt: skip
-    parser.add_argument(
         '--note', metavar='FILE', help='recording note (YAML) for bags that carry none'
     )
     parser.add_argument(
@@ -85,6 +85,67 @@ def common_options(parser: argparse.ArgumentParser) -> None:
     use_anyway_option(parser)
     parser.add_argument('--date', help='ISO 8601 date to put into the results [now]')
     parser.add_argument('--quiet', action='store_true', help='no progress, no tables')
+
+
+def window_option(parser: argparse.ArgumentParser) -> None:
+    """Of programs that simulate."""
+    parser.add_argument(
+        '--window', type=float, metavar='SECONDS',
+        help='cut every record into windows [only where the whole cannot be followed]',
+    )  # fmt: skip
+
+
+def search_options(parser: argparse.ArgumentParser) -> None:
+    """Of programs that search the library of effects."""
+    parser.add_argument(
+        '--effects', metavar='A,B', help='try only these effects [the whole library]'
+    )
+    parser.add_argument('--workers', type=int, help='local processes [one per core]')
+    parser.add_argument(
+        '--held', '--hold-out', metavar='GLOB',
+        help="records to judge on, by name, such as 'spring*_2' [every second recording of a "
+        'set-up]',
+    )  # fmt: skip
+
+
+def chosen_effects(text: str | None, model: Model) -> tuple[str, ...] | None:
+    """The effects that were asked for; None for the whole library."""
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(',') if name.strip())
+    body = model.mechanism
+    known = {effect(body, at).label for effect in LIBRARY.values() for at in effect.sites(body)}
+    known |= set(LIBRARY)
+    for name in names or ('',):
+        if name not in known:
+            raise ValueError(
+                f'--effects: no effect {name!r}; the library has: {", ".join(sorted(LIBRARY))}'
+            )
+    return names
+
+
+def chosen_workers(count: int | None) -> int | None:
+    """The number of processes that was asked for."""
+    if count is not None and count < 0:
+        raise ValueError(f'--workers is {count}; it must not be negative')
+    return count
+
+
+def records_held(pattern: str | None, loaded: Loaded) -> tuple[str, ...] | None:
+    """Names of the records that judge, if somebody says which."""
+    if not pattern:
+        return None
+    names = [record.name for record in loaded.records]
+    held = tuple(
+        n for n in names
+        if any(fnmatch.fnmatchcase(x, pattern) for x in (n, loaded.origin[n]))
+    )  # fmt: skip
+    if not held or len(held) == len(names):
+        raise ValueError(
+            f'--held {pattern!r} matches {"no" if not held else "every"} record; '
+            f'there are: {", ".join(names)}'
+        )
+    return held
 
 
 def load_note(path: str | None) -> dict[str, Any] | None:

@@ -11,7 +11,6 @@ the same command with more time goes on from there.
 """
 
 import argparse
-import fnmatch
 import math
 import shutil
 import sys
@@ -23,7 +22,6 @@ from pathlib import Path
 from rich.console import Console
 
 from cg_description.paths import model_path
-from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_sysid.checks.faults import FaultSignal
 from cg_sysid.checks.loading import Loaded, load_bags
@@ -73,9 +71,8 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     cli.common_options(made)
-    made.add_argument(
-        '--effects', metavar='A,B', help='try only these effects [the whole library]'
-    )
+    cli.window_option(made)
+    cli.search_options(made)
     made.add_argument(
         '--rounds', type=int, default=Options.rounds, help='most effects to add [%(default)s]'
     )
@@ -84,15 +81,9 @@ def parser() -> argparse.ArgumentParser:
         help='end the search after this time with the best answer so far; inf for no limit '
         '[%(default)g]',
     )  # fmt: skip
-    made.add_argument('--workers', type=int, help='local processes [one per core]')
     made.add_argument(
         '--scheduler', metavar='ADDRESS',
         help='fit on the workers of this dask scheduler instead, such as tcp://127.0.0.1:8786',
-    )  # fmt: skip
-    made.add_argument(
-        '--held', '--hold-out', metavar='GLOB',
-        help="records to judge on, by name, such as 'spring*_2' [every second recording of a "
-        'set-up]',
     )  # fmt: skip
     return made
 
@@ -111,15 +102,13 @@ def work(options: argparse.Namespace) -> int:
             f'--budget is {options.budget:g}; it must be positive (s), inf is allowed'
         )
     deadline = Deadline(options.budget)
-    if options.workers is not None and options.workers < 0:
-        raise ValueError(f'--workers is {options.workers}; it must not be negative')
-    if options.scheduler is not None and options.workers is not None:
+    if cli.chosen_workers(options.workers) is not None and options.scheduler is not None:
         raise ValueError('--workers are local processes; leave it out where --scheduler is given')
     if options.out.is_file():
         raise ValueError(f'--out {options.out}: a file is in the way; name a directory')
     model_file = model_path(options.model)
     model = Model.load(model_file)
-    effects = _effects(options.effects, model)
+    effects = cli.chosen_effects(options.effects, model)
     note = cli.load_note(options.note)
     fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
     with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
@@ -205,41 +194,13 @@ def _why(loaded: Loaded) -> str:
     return f'{which} broken, and nothing was fitted. {first.name}: {first.reason}.'
 
 
-def _effects(text: str | None, model: Model) -> tuple[str, ...] | None:
-    """The effects that were asked for; None for the whole library."""
-    if text is None:
-        return None
-    names = tuple(name.strip() for name in text.split(',') if name.strip())
-    body = model.mechanism
-    known = {effect(body, at).label for effect in LIBRARY.values() for at in effect.sites(body)}
-    known |= set(LIBRARY)
-    for name in names or ('',):
-        if name not in known:
-            raise ValueError(
-                f'--effects: no effect {name!r}; the library has: {", ".join(sorted(LIBRARY))}'
-            )
-    return names
-
-
 def _options(
     options: argparse.Namespace, effects: tuple[str, ...] | None, loaded: Loaded, model: Model
 ) -> Options:
-    held = None
-    if options.held:
-        names = [record.name for record in loaded.records]
-        held = tuple(
-            n for n in names
-            if any(fnmatch.fnmatchcase(x, options.held) for x in (n, loaded.origin[n]))
-        )  # fmt: skip
-        if not held or len(held) == len(names):
-            raise ValueError(
-                f'--held {options.held!r} matches {"no" if not held else "every"} record; '
-                f'there are: {", ".join(names)}'
-            )
     return Options(
-        effects=effects, rounds=options.rounds, workers=options.workers, held=held,
-        experiments=tuple(experiments_for(model)), kept=options.out / FITS,
-        wholes=loaded.wholes,
+        effects=effects, rounds=options.rounds, workers=options.workers,
+        held=cli.records_held(options.held, loaded), experiments=tuple(experiments_for(model)),
+        kept=options.out / FITS, wholes=loaded.wholes,
     )  # fmt: skip
 
 

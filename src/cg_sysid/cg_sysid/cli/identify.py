@@ -44,6 +44,7 @@ def parser() -> argparse.ArgumentParser:
         'be used',
     )
     cli.common_options(made)
+    cli.window_option(made)
     made.add_argument(
         '--only', metavar='A,B', help='full names of the parameters to identify [all free ones]'
     )

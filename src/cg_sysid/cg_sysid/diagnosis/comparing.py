@@ -21,6 +21,8 @@ from cg_sysid.search.successive_halving import Effects
 from cg_sysid.search.task import Task, candidates_for
 from cg_sysid.search.torque_screening import KEPT, scores
 
+FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
+
 
 def compare(
     work: Workspace, base: Outcome, beaten: Outcome | None = None, idle: Effects = ()
@@ -86,6 +88,8 @@ def less_shapes(work: Workspace, comparison: Comparison) -> Comparison:
 def worth_a_look(work: Workspace, base: Outcome, idle: Effects = ()) -> Effects:
     """What can be tried on top of a base less what is idle, and what torques rule out."""
     effects = [effect for effect in effects_on(work, base) if effect not in idle]
+    if len(base.model.mechanism.coordinates) < FEWEST_JOINTS:
+        return effects
     key = work.added(base), bool(base.task.bounds)
     if idle and key not in work.torques and len(effects) <= KEPT:
         return effects

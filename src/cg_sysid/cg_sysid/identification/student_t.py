@@ -3,8 +3,11 @@
     -2 log L = sum (nu + 1) log(1 + (r/s)^2 / nu) + 2 log s,   nu = 4                          (T)
 
 with s, one for each coordinate, the most likely: a fit is ranked by what it leaves, and by no
-weights that another has chosen.
+weights that another has chosen. NaN is where there is no residual, as of a joint that a set-up
+locks; where a simulation ran away it is infinite.
 """
+
+import warnings
 
 import numpy as np
 
@@ -15,18 +18,22 @@ SCALED = 1e-3  # relative change of s at which it has settled
 
 def spread_of(residual: np.ndarray) -> np.ndarray:
     """Standard deviation of most of the rows, shape (m,)."""
-    return np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', RuntimeWarning)  # of a joint that is locked everywhere
+        spread = 1.4826 * np.nanmedian(np.abs(residual), axis=0)
+    return np.fmax(spread, 1e-12)
 
 
 def scale_of(residual: np.ndarray) -> np.ndarray:
     """The most likely s of (T), shape (m,): each step of this makes it more likely."""
     scale = spread_of(residual)
-    if not np.isfinite(residual).all():
+    if np.isinf(residual).any():
         return scale
+    count = np.maximum(np.isfinite(residual).sum(axis=0), 1)
     settled = False
     while not settled:
         rows = residual / row_scale(residual, scale)
-        new = np.maximum(scale * np.sqrt(np.mean(rows**2, axis=0)), 1e-12)
+        new = np.maximum(scale * np.sqrt(np.nansum(rows**2, axis=0) / count), 1e-12)
         settled, scale = bool((np.abs(new - scale) < SCALED * scale).all()), new
     return scale
 
@@ -37,11 +44,21 @@ def row_scale(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def deviance(residual: np.ndarray) -> float:
-    """(T) at its most likely s, but for a constant."""
+    """(T) at its most likely s, but for a constant; infinite where a simulation ran away."""
+    return float(deviance_by_column(residual).sum())
+
+
+def deviance_by_column(residual: np.ndarray) -> np.ndarray:
+    """The same, as the sum of its columns has it, shape (m,)."""
+    if np.isinf(residual).any():
+        return np.full(residual.shape[1], np.inf)
     scale = scale_of(residual)
-    with np.errstate(invalid='ignore'):
-        size = np.abs(residual / scale)
-    if not np.all(size < RUN_AWAY):
-        return np.inf
-    each = (TAILS + 1) * np.log1p(size**2 / TAILS)
-    return float(each.sum() + 2 * len(residual) * np.log(scale).sum())
+    if np.any(np.abs(residual / scale) >= RUN_AWAY):
+        return np.full(len(scale), np.inf)
+    count = np.isfinite(residual).sum(axis=0)
+    return np.nansum(deviances(residual, scale), axis=0) + 2 * count * np.log(scale)
+
+
+def deviances(residual: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(T) of each residual at a given s, but for a constant and log s, shape (rows, m)."""
+    return (TAILS + 1) * np.log1p((residual / scale) ** 2 / TAILS)

@@ -48,10 +48,11 @@ class TorqueFit:
 
     Attributes:
         values: Full parameter name -> value.
-        rms: Of the residual of each free coordinate, N m (N), shape (m,).
-        relative: That over the torque that acted there, shape (m,); NaN where nothing drives.
+        rms: Of the residual of each coordinate of the robot, N m (N), shape (n,); NaN of one that
+            is locked in all records.
+        relative: That over the torque that acted there, shape (n,); NaN where nothing drives.
         deviance: (T) and the squared distance from the belief; infinite of a rotor that runs away.
-        scale: s of (T), N m (N), shape (m,).
+        scale: s of (T), N m (N), shape (n,).
     """
 
     values: Mapping[str, float]
@@ -195,7 +196,7 @@ def _descend(
         if out_of_reach(costs, beaten):
             break
         of_rows = row_scale(residual, scale_of(residual))
-        r = (residual / of_rows).ravel()
+        r, of_rows = np.nan_to_num((residual / of_rows).ravel()), np.nan_to_num(of_rows, nan=1.0)
         with np.errstate(over='ignore', invalid='ignore'):
             jacobian = derivatives(problems, unknowns, theta)
             j = (jacobian / of_rows[:, :, None]).reshape(len(r), -1)
@@ -224,12 +225,18 @@ def _descend(
         costs.append(cost)
         if settled:
             break
-    acted = np.sqrt(np.mean(np.vstack([p.acted for p in problems]) ** 2, axis=0))
-    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-        rms = np.sqrt(np.mean(residual**2, axis=0))  # infinite where a start ran away
+    acted = _rms(np.vstack([p.of_all(p.acted) for p in problems]))
+    rms = _rms(residual)  # infinite where a start ran away
+    with np.errstate(divide='ignore', invalid='ignore'):
         relative = np.where(acted > 0, rms / acted, np.nan)
     values = {u.name: u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)}
     return TorqueFit(values, rms, relative, cost, scale_of(residual))
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Of each column, of the rows that have a number; NaN where none has."""
+    with np.errstate(invalid='ignore', over='ignore'):
+        return np.sqrt(np.nansum(values**2, axis=0) / np.isfinite(values).sum(axis=0))
 
 
 class AlongRows:
@@ -275,6 +282,7 @@ class Problem:
         vector: Parameters: of the model without states, then those of each of `followed`.
         places: Of the unknowns among them.
         acted: Torque that was applied on each free coordinate, shape (k, m).
+        free: Which of the robot's n coordinates these are, true or false, shape (n,).
         followed: Effects whose states are simulated along the motion.
     """
 
@@ -285,7 +293,16 @@ class Problem:
     vector: np.ndarray
     places: list[int]
     acted: np.ndarray
+    free: np.ndarray
     followed: tuple[AlongMotion, ...] = ()
+
+    def of_all(self, values: np.ndarray, locked: float = np.nan) -> np.ndarray:
+        """Values of the free coordinates among those of all, shape (k, m, ...) -> (k, n, ...)."""
+        if self.free.all():
+            return values
+        found = np.full((len(values), len(self.free), *values.shape[2:]), locked)
+        found[:, self.free] = values
+        return found
 
     def at(self, model: Model) -> 'Problem':
         """The same with the values of a model of this structure."""
@@ -303,9 +320,9 @@ class Problem:
         found = self.error(vector[:plain])[:, :, 0]
         for effect, own in self._followed(vector):
             force, _ = effect(vector[:plain], vector[own])
-            with np.errstate(invalid='ignore'):  # of one that ran away
+            with np.errstate(invalid='ignore'):
                 found = found + force[:, None] * effect.direction
-        return found
+        return np.where(np.isnan(found), np.inf, found)  # of one that ran away
 
     def derivative(self, vector: np.ndarray) -> np.ndarray:
         """Its derivative by the unknowns, shape (k, m, unknowns)."""
@@ -366,7 +383,9 @@ def problems_of(
             AlongRows(e, every, ca.densify(x)) for x in (balance, ca.jacobian(balance, moved))
         )
         vector, acted = _vector(model, setup), _acted(plain, e, every)
-        found.append(Problem(e, error, slope, every, vector, places, acted, followed))
+        moving = plain.mechanism.kinematics(setup).names
+        free = np.array([name in moving for name in plain.mechanism.coordinates])
+        found.append(Problem(e, error, slope, every, vector, places, acted, free, followed))
     return found
 
 
@@ -407,17 +426,26 @@ def _driving(model: Model, setup: Setup) -> np.ndarray:
 def residuals(
     problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
 ) -> np.ndarray:
-    """(TE) of all rows, shape (rows, m)."""
-    return np.vstack([p.residual(_parameters(p, unknowns, theta)) for p in problems])
+    """(TE) of all rows, shape (rows, n), NaN of joints that a set-up locks."""
+    return np.vstack([p.of_all(p.residual(_parameters(p, unknowns, theta))) for p in problems])
+
+
+def left_by(model: Model, data_sets: Sequence[DataSet]) -> list[np.ndarray]:
+    """(TE) of a model as it is along each record that can be used, as of `residuals`."""
+    found = []
+    for p in problems_of(model, data_sets, ()):
+        begins = np.flatnonzero(p.motion.first)
+        found += np.split(p.of_all(p.residual(p.vector)), begins[1:])
+    return found
 
 
 def derivatives(
     problems: Sequence[Problem], unknowns: Sequence[Unknown], theta: np.ndarray
 ) -> np.ndarray:
-    """Its derivative by the coordinates of the unknowns, shape (rows, m, unknowns)."""
+    """Its derivative by the coordinates of the unknowns, shape (rows, n, unknowns), 0 of those."""
     values = [u.to_value(float(t)) for u, t in zip(unknowns, theta, strict=True)]
     chain = [v if u.logarithmic else 1.0 for v, u in zip(values, unknowns, strict=True)]
-    by_value = [p.derivative(_parameters(p, unknowns, theta)) for p in problems]
+    by_value = [p.of_all(p.derivative(_parameters(p, unknowns, theta)), 0.0) for p in problems]
     return np.vstack(by_value) * np.array(chain)
 
 

@@ -107,12 +107,7 @@ class ModelSelection:
         self.first_held = len(train)
         self.data_sets = data_sets
         self.steps = [float(np.median(np.diff(data_set.time))) for data_set in data_sets]
-        judged = sum(data_set.duration for data_set in held)
-        block = min(
-            settings.SELECTION.block_s,
-            max(judged / settings.SELECTION.fewest_blocks, settings.SELECTION.shortest_block_s),
-        )
-        self.rows_per_block = max(1, int(block / np.median(self.steps)))
+        self.rows_per_block = max(1, int(block_s(held) / np.median(self.steps)))
         self.before_causes = np.inf
 
     def without_cause(self, base: Outcome) -> None:
@@ -314,6 +309,13 @@ class ModelSelection:
 
     def _white(self, o: Outcome) -> bool:
         return self.whiteness(o) > settings.NOISE.white
+
+
+def block_s(held: Sequence[DataSet]) -> float:
+    """Length of the blocks that vote on records held out, s."""
+    judged = sum(data_set.duration for data_set in held)
+    shortest = max(judged / settings.SELECTION.fewest_blocks, settings.SELECTION.shortest_block_s)
+    return min(settings.SELECTION.block_s, shortest)
 
 
 def _immaterial(o: Outcome) -> bool:

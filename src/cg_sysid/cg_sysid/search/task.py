@@ -43,7 +43,7 @@ class Task:
         effect: Effect and place.
         events: What each data set has of its own, as far as the base knows it: its name ->
             full name -> value (unknowns.own_unknowns).
-        bounds: Small faults that the base may have (imperfections.py).
+        bounds: Small faults that the base may have (nuisance.py).
         warm_starts: Go on from the best of these fits, the most promising first; without any from
             the effect's own starts.
         iterations: Limit for whole records.

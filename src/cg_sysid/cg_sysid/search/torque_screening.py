@@ -23,7 +23,7 @@ candidates, and a fit of one takes seconds.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -44,7 +44,6 @@ from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.starts import starts_of
 from cg_sysid.search.task import EffectAt
 
-FEWEST_JOINTS = 2  # from which looks at all effects at all joints take too long
 SEEN = 10.0  # nats that a candidate has to gain
 FITTED = 16  # candidates that are fitted by torque, the best first
 STARTS = 4  # of each, from which they are fitted, the best first
@@ -72,12 +71,14 @@ class Scores:
             of sensors and delays.
         worst: Joints, those of which torques are explained or motions simulated worst first.
         pushed: What pushes once, where it may have: (effect, place).
+        extended: The base with each of `fitted` where it has a fit, at its start, and that fit.
     """
 
     gains: dict[EffectAt, float]
     fitted: dict[EffectAt, float]
     worst: tuple[str, ...]
     pushed: tuple[EffectAt, ...] = ()
+    extended: dict[EffectAt, tuple[Model, TorqueFit]] = field(default_factory=dict)
 
     def worth(self, candidates: Sequence[EffectAt]) -> list[EffectAt]:
         """Those to be looked at."""
@@ -123,6 +124,8 @@ def scores(
     carry_out: CarryOut = one_by_one,
     held: Sequence[DataSet] = (),
     missed: Mapping[str, float] | None = None,
+    numbers: Mapping[str, float] | None = None,
+    most: int = FITTED,
 ) -> Scores | None:
     """What the torques say of candidates on top of a model.
 
@@ -134,23 +137,25 @@ def scores(
         carry_out: Who fits.
         held: Other records, in which somebody may have pushed as well.
         missed: What the base leaves of each output in simulation, chi2/N, where that is known.
+        numbers: Where the base stands (full name -> value), if its torque fit is not to set out
+            from the file's numbers.
+        most: Candidates with a D that are fitted, the best first.
 
     Returns:
-        Their scores; None where torques say nothing, and of a robot of few joints, of which all
-        candidates can be looked at.
+        Their scores; None where torques say nothing.
     """
-    if len(model.mechanism.coordinates) < FEWEST_JOINTS or not torque_error.can(model):
+    if not torque_error.can(model):
         return None
-    base = _Base.of(model, train, bounds)
+    base = _Base.of(model, train, bounds, numbers)
     if base is None:
         return None
     tests = {c: said for c in candidates if (said := base.score_tests(*c)) is not None}
     gains = {c: max(0.0, *of_starts) for c, of_starts in tests.items()}
-    free = model.mechanism.kinematics(train[0].setup).names
-    noise = _noise(train[0], base.by_motion)
+    joints = model.mechanism.coordinates
+    noise = _noise(train[0], base.problems, base.by_motion)
     order = np.argsort(-base.fitted.rms / np.maximum(noise, 1e-12))
-    worst = _worst([free[k] for k in order], missed or {})
-    follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:FITTED]
+    worst = _worst([joints[k] for k in order], missed or {})
+    follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:most]
     promising = {c: [int(k) for k in np.argsort(tests[c])[::-1][:STARTS]] for c in follow}
     for name, at in candidates:
         effect = LIBRARY[name](model.mechanism, at)
@@ -158,15 +163,19 @@ def scores(
             continue
         if _on_worst(name, at, worst):
             promising[name, at] = list(range(len(starts_of(effect))))[:STARTS]
-    gained = carry_out(
-        _gain_by_fit,
+    fits = carry_out(
+        _best_fit,
         [(base.plain, c, starts, train, bounds, base.fitted) for c, starts in promising.items()],
         'what torques say',
     )
-    by_fit = dict(zip(promising, gained, strict=True))
+    extended = {c: found for c, found in zip(promising, fits, strict=True) if found is not None}
+    by_fit = {
+        c: (base.fitted.deviance - extended[c][1].deviance) / 2 if c in extended else 0.0
+        for c in promising
+    }
     pushers = [c for c in candidates if _happens(c[0])]
-    pushed = base.pushed(pushers, [*train, *held], free) if pushers else ()
-    return Scores(gains, by_fit, worst, pushed)
+    pushed = base.pushed(pushers, [*train, *held]) if pushers else ()
+    return Scores(gains, by_fit, worst, pushed, extended)
 
 
 @dataclass(frozen=True)
@@ -181,7 +190,7 @@ class _Base:
         fitted: The torque fit.
         problems: Motions, with the torques that the model predicts.
         by_motion: Derivatives of the torques by the motion, of each of these.
-        scale: By which to divide each residual, shape (rows, m).
+        scale: By which to divide each residual, shape (rows, n).
         taken: Orthonormal columns: what its numbers and beliefs can take.
         left: Weighted residual and beliefs, less that.
     """
@@ -198,12 +207,18 @@ class _Base:
     left: np.ndarray
 
     @classmethod
-    def of(cls, model: Model, train: Sequence[DataSet], bounds: Bounds) -> '_Base | None':
+    def of(
+        cls,
+        model: Model,
+        train: Sequence[DataSet],
+        bounds: Bounds,
+        at: Mapping[str, float] | None,
+    ) -> '_Base | None':
         """A model fitted by torques; None where they say nothing of it."""
         plain = torque_error.without_states(model)
         declared = plain.declarations
         unknowns = tuple(u for u in unknowns_of(model, None, bounds) if u.name in declared)
-        fitted = torque_error.fit_by_torque(plain, train, None, bounds)
+        fitted = torque_error.fit_by_torque(plain, train, None, bounds, at)
         problems = torque_error.problems_of(plain, train, unknowns)
         if fitted is None or not problems:
             return None
@@ -213,14 +228,14 @@ class _Base:
         residual = torque_error.residuals(problems, unknowns, theta)
         jacobian = torque_error.derivatives(problems, unknowns, theta)
         # Few rows are far off, where friction turns within a window: they count less, as in fits.
-        scale = row_scale(residual, fitted.scale)
+        scale = np.nan_to_num(row_scale(residual, fitted.scale), nan=1.0)
         known = (jacobian / scale[:, :, None]).reshape(residual.size, -1)
         # The belief is as good as measurements of the numbers themselves.
         believed = np.isfinite(tolerance)
         belief = np.diag(1 / tolerance)[believed]
         taken, _ = np.linalg.qr(np.vstack([known, belief]))
         off = ((theta - prior) / tolerance)[believed]
-        left = np.concatenate([(residual / scale).ravel(), off])
+        left = np.concatenate([np.nan_to_num(residual / scale).ravel(), off])
         values = plain.with_values(fitted.values)
         problems = _as_predicted(plain, problems, residual)
         by_motion = [_by_motion(problem, values) for problem in problems]
@@ -241,12 +256,12 @@ class _Base:
         return float(self.left @ self.left - rest @ rest) / 2
 
     def pushed(
-        self, pushers: Sequence[EffectAt], data_sets: Sequence[DataSet], free: Sequence[str]
+        self, pushers: Sequence[EffectAt], data_sets: Sequence[DataSet]
     ) -> tuple[EffectAt, ...]:
         """Of those that push once, who may have in one of these records."""
         problems = torque_error.problems_of(self.plain, data_sets, self.unknowns)
-        residual = torque_error.residuals(problems, self.unknowns, self.theta)
-        return _pushed(self.model, pushers, [p.motion for p in problems], residual, free)
+        residual = np.nan_to_num(torque_error.residuals(problems, self.unknowns, self.theta))
+        return _pushed(self.model, pushers, problems, residual)
 
 
 def _worst(by_torque: Sequence[str], missed: Mapping[str, float]) -> tuple[str, ...]:
@@ -283,21 +298,19 @@ def _beginning(first: np.ndarray) -> np.ndarray:
     return begun
 
 
-def _beyond_friction(
-    model: Model, error: np.ndarray, rates: np.ndarray, free: Sequence[str]
-) -> np.ndarray:
+def _beyond_friction(model: Model, error: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """What is left of errors of torques where a joint turns around, less what friction may do.
 
     Dry friction changes its sign there, so twice of it; where the model has none, all.
 
     Args:
         model: With its numbers fitted.
-        error: N m (N), (rows, m).
-        rates: (rows, m).
-        free: Names of the m coordinates.
+        error: N m (N), (rows, n).
+        rates: (rows, n).
     """
-    allowed = np.full(len(free), np.inf)
-    for k, joint in enumerate(free):
+    joints = model.mechanism.coordinates
+    allowed = np.full(len(joints), np.inf)
+    for k, joint in enumerate(joints):
         level = model.dry_friction(joint)
         if level:
             allowed[k] = 2 * level
@@ -308,9 +321,8 @@ def _beyond_friction(
 def _pushed(
     model: Model,
     candidates: Sequence[EffectAt],
-    motions: Sequence[Motion],
+    problems: Sequence[Problem],
     error: np.ndarray,
-    free: Sequence[str],
 ) -> tuple[EffectAt, ...]:
     """The pushes that are worth a fit, if any.
 
@@ -321,16 +333,15 @@ def _pushed(
     Args:
         model: The base, with its numbers fitted.
         candidates: Pushes, (effect, place).
-        motions: What was measured, of as many rows together.
-        error: Of the torques, N m (N), (rows, m).
-        free: Names of the m coordinates.
+        problems: What was measured, of as many rows together.
+        error: Of the torques, N m (N), 0 of joints that a set-up locks, (rows, n).
     """
-    rates = np.vstack([motion.rate for motion in motions])
-    first = np.concatenate([motion.first for motion in motions])
+    rates = np.vstack([p.of_all(p.motion.rate, 0.0) for p in problems])
+    first = np.concatenate([p.motion.first for p in problems])
     error = np.where(_beginning(first)[:, None], 0.0, error)
-    settled = _beyond_friction(model, error, rates, free)
+    settled = _beyond_friction(model, error, rates)
     spread = spread_of(error)  # a push is far off, and counts in full
-    about = {c: _about(model, c, free) for c in candidates}
+    about = {c: _about(model, c) for c in candidates}
     clear, every = (
         {c: _gains((rows / spread)[:, joints]) for c, joints in about.items()}
         for rows in (settled, error)
@@ -351,11 +362,12 @@ def _pushed(
     return tuple(dict.fromkeys(nearest))
 
 
-def _about(model: Model, candidate: EffectAt, free: Sequence[str]) -> list[int]:
-    """Of the coordinates of these names, those that a push acts about."""
+def _about(model: Model, candidate: EffectAt) -> list[int]:
+    """Of the coordinates, those that a push acts about."""
     effect = LIBRARY[candidate[0]](model.mechanism, candidate[1])
     acting = {p.name for p in effect.parameters if p.neutral is not None}
-    return [k for k, joint in enumerate(free) if f'impulse_{joint}' in acting]
+    joints = model.mechanism.coordinates
+    return [k for k, joint in enumerate(joints) if f'impulse_{joint}' in acting]
 
 
 def _gains(error: np.ndarray) -> np.ndarray:
@@ -378,15 +390,15 @@ def _late(name: str) -> bool:
     return LIBRARY[name].place == 'timing'
 
 
-def _gain_by_fit(
+def _best_fit(
     model: Model,
     candidate: EffectAt,
     promising: Sequence[int],
     train: Sequence[DataSet],
     bounds: Bounds,
     base: TorqueFit,
-) -> float:
-    """Nats that a candidate gains, fitted together with the numbers of the base.
+) -> tuple[Model, TorqueFit] | None:
+    """The base with a candidate, fitted together: at its best start, and what the torques say.
 
     Args:
         model: The base, without states.
@@ -404,7 +416,8 @@ def _gain_by_fit(
     starts = starts_of(LIBRARY[name](model.mechanism, at))
     extended = [without.with_effect(name, at, **starts[k]) for k in promising]
     found = torque_error.fits_by_torque(extended, train, None, own, at=base.values)
-    return max(((base.deviance - fitted.deviance) / 2 for fitted in found), default=0.0)
+    pairs = zip(extended, found, strict=True) if found else []
+    return min(pairs, key=lambda pair: pair[1].deviance, default=None)
 
 
 def _as_predicted(
@@ -422,7 +435,7 @@ def _as_predicted(
         basis = np.asarray(model.mechanism.kinematics(motion.setup).basis)
         last = first + len(motion.position)
         inputs = motion.inputs.copy()
-        error = residual[first:last] @ np.linalg.pinv(rows @ basis)
+        error = residual[first:last, problem.free] @ np.linalg.pinv(rows @ basis)
         inputs[:, : len(rows)] -= error
         acted = problem.acted - error @ rows @ basis
         found.append(replace(problem, motion=replace(motion, inputs=inputs), acted=acted))
@@ -454,7 +467,7 @@ def _columns(
     problems: Sequence[Problem],
     by_motion: Sequence[np.ndarray],
 ) -> list[np.ndarray] | None:
-    """D of a candidate at each of its starts, (rows, m, numbers); None where it has none."""
+    """D of a candidate at each of its starts, (rows, n, numbers); None where it has none."""
     kind = LIBRARY[name]
     effect = kind(model.mechanism, at)
     # Without bodies gravity pulls at nothing: what turns it has no D either.
@@ -472,7 +485,7 @@ def _columns(
             bare = bare.with_effect(other.name, other.at, **model.values_of(other))
     from_starts = [bare.with_effect(name, at, **start) for start in starts_of(effect)]
     found = [
-        _from_starts(from_starts, effect.label, problem, motion)
+        [problem.of_all(d, 0.0) for d in _from_starts(from_starts, effect.label, problem, motion)]
         for problem, motion in zip(problems, by_motion, strict=True)
     ]
     return [np.concatenate(columns) for columns in zip(*found, strict=True)]
@@ -488,30 +501,30 @@ def _from_starts(
         k for k, n in enumerate(e.parameter_names)
         if n.startswith(f'{label}.') and model.declarations[n].free
     ]  # fmt: skip
-    f = _by_parameters(e, own, sensed=e.coordinates == len(model.mechanism.coordinates))
+    f = _by_parameters(e, own, [int(k) for k in np.flatnonzero(problem.free)])
     return [
         _one_column(f, parameter_vector(start, motion.setup), problem, by_motion)
         for start in models
     ]
 
 
-def _by_parameters(e: Equations, own: Sequence[int], *, sensed: bool) -> ca.Function:
+def _by_parameters(e: Equations, own: Sequence[int], sensors: Sequence[int]) -> ca.Function:
     """Derivatives by some parameters of forces, of what the sensors show, and of delays.
 
     Args:
         e: Of a robot without bodies.
         own: Places of the parameters.
-        sensed: Each coordinate has its sensor.
+        sensors: Which outputs show the m free coordinates.
     """
     moved = ca.vertcat(*(e.p[k] for k in own))
     m = e.coordinates
     s, ds, a = e.x[:m], e.x[m : 2 * m], e.acceleration
-    seen = e.outputs[:m] - s if sensed else ca.SX.zeros(m)
+    seen = e.outputs[sensors] - s
     seen_rate = ca.jtimes(seen, s, ds)
     seen_acceleration = ca.jtimes(seen_rate, s, ds) + ca.jtimes(seen_rate, ds, a)
     # A sensor that shows more than there is: what is there is less than measured.
     shown = -ca.jacobian(ca.vertcat(seen, seen_rate, seen_acceleration), moved)
-    late = ca.jacobian(ca.vertcat(e.input_delay, e.output_delays[:m]), moved)
+    late = ca.jacobian(ca.vertcat(e.input_delay, e.output_delays[sensors]), moved)
     return ca.Function(
         'columns', [e.x, e.u, a, e.p],
         [ca.densify(x) for x in (ca.jacobian(e.imbalance, moved), shown, late)],
@@ -566,14 +579,18 @@ def _by_motion(problem: Problem, model: Model) -> np.ndarray:
     return found.reshape(m, k, 3 * m).transpose(1, 0, 2)
 
 
-def _noise(data_set: DataSet, by_motion: Sequence[np.ndarray]) -> np.ndarray:
+def _noise(
+    data_set: DataSet, problems: Sequence[Problem], by_motion: Sequence[np.ndarray]
+) -> np.ndarray:
     """Torque error that the noise of the encoders makes, for each coordinate, N m (N)."""
-    m = by_motion[0].shape[1]
-    sigma = data_set.sigma[:m]
     spacing = float(np.median(np.diff(data_set.time)))
     gains = noise_gains(spacing)
-    spread = np.concatenate([gain * sigma for gain in gains])
-    return np.sqrt(np.mean(np.vstack([(b**2) @ spread**2 for b in by_motion]), axis=0))
+    squares = []
+    for problem, slope in zip(problems, by_motion, strict=True):
+        sigma = data_set.sigma[: len(problem.free)][problem.free]
+        spread = np.concatenate([gain * sigma for gain in gains])
+        squares.append(problem.of_all(slope**2 @ spread**2, 0.0))
+    return np.sqrt(np.mean(np.vstack(squares), axis=0))
 
 
 def _joint(place: str) -> str:

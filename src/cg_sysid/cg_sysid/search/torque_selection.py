@@ -1,0 +1,346 @@
+"""Which laws the torques of a robot lack: effects taken up while records held out gain by them.
+
+    torque fit of the numbers -> score tests of all effects (torque_screening.py)
+      -> torque fits of the best -> that which gains most is taken up, if records held out gain too
+      -> again on top of it, until none does -> each asked whether the others do without it
+
+A torque fit takes a second where one by simulation takes a minute, and does not mind which
+controller kept the robot on its way. So an arm of six joints has an answer in a minute or two,
+and a real one may have one at all. It is no diagnosis: smoothed torques know little of delays and
+sensors, and what moves by itself, as a rotor behind a spring, is not asked. `diagnose` judges in
+simulation what is found here.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cg_dynamics.effects import LIBRARY
+from cg_dynamics.model import Model
+from cg_sysid.identification import torque_error
+from cg_sysid.identification.data_set import DataSet
+from cg_sysid.identification.information_criterion import block_gain, independent_samples
+from cg_sysid.identification.measured_motion import STRIDE_S
+from cg_sysid.identification.student_t import (
+    deviance_by_column,
+    deviances,
+    row_scale,
+    scale_of,
+)
+from cg_sysid.identification.torque_error import TorqueFit
+from cg_sysid.identification.unknowns import IdentificationError, unknowns_of
+from cg_sysid.parallel import CarryOut, one_by_one
+from cg_sysid.search import settings
+from cg_sysid.search.model_selection import block_s
+from cg_sysid.search.task import EffectAt, candidates_for
+from cg_sysid.search.torque_screening import scores
+from cg_sysid.text import measured
+
+FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
+MOST = 16  # effects that are taken up
+MATERIAL = (
+    0.03  # of the squared torque error of one joint, held out, that an effect takes at least
+)
+LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
+
+Sizes = Mapping[str, tuple[float, float, str]]
+
+
+@dataclass(frozen=True)
+class Law:
+    """An effect that the torques lack.
+
+    Attributes:
+        label: Its label.
+        nats: Evidence of the records fitted to.
+        significance: Standard errors by which the torque error of records held out falls.
+        taken: Share of the squared torque error of each coordinate that it takes, shape (n,).
+        parameters: Name -> value, standard deviation, unit, by all records.
+        rivals: Labels of others that these torques cannot tell from it.
+        reason: Why it is not taken up; empty if it is worth it.
+    """
+
+    label: str
+    nats: float
+    significance: float
+    taken: np.ndarray
+    parameters: Sizes
+    rivals: tuple[str, ...] = ()
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class TorqueSelection:
+    """What the torques say of a robot.
+
+    Attributes:
+        coordinates: Names of the robot's n coordinates.
+        stated: Torque error of records held out over the torque that acted, by the file's numbers,
+            shape (n,); NaN where nothing drives.
+        identified: The same with the numbers that the torques say.
+        extended: The same with the laws.
+        laws: Effects that were taken up, in the order in which they were.
+        turned_down: Others that were fitted on top of these and are not worth it, the best first.
+        model: The model with them, and with the numbers that the torques of all records say.
+    """
+
+    coordinates: tuple[str, ...]
+    stated: np.ndarray
+    identified: np.ndarray
+    extended: np.ndarray
+    laws: tuple[Law, ...]
+    turned_down: tuple[Law, ...]
+    model: Model
+
+
+def select(
+    model: Model,
+    train: Sequence[DataSet],
+    held: Sequence[DataSet],
+    names: Sequence[str] | None = None,
+    carry_out: CarryOut = one_by_one,
+) -> TorqueSelection:
+    """Take up effects that the torques of a robot lack.
+
+    Args:
+        model: The nominal model, of a robot of a URDF.
+        train: Whole records that are fitted.
+        held: Whole records that judge.
+        names: Effects, or labels of effects, that may be taken up; by default all of the library.
+        carry_out: Who fits.
+
+    Raises:
+        IdentificationError: if the torques of these records say nothing of this model.
+    """
+    if not torque_error.can(model):
+        raise IdentificationError(
+            f'model {model.name!r}: torques are compared for a robot of a URDF with an encoder at '
+            'every joint that moves'
+        )
+    search = _Search(train, held, names, carry_out)
+    plain = torque_error.without_states(model)
+    nominal = base = search.fit(plain, {})
+    laws: list[Law] = []
+    while True:
+        judged = search.on_top(base)
+        worth = [(law, there) for law, there in judged if not law.reason]
+        if not worth or len(laws) == MOST:
+            break
+        (best, base), *others = worth
+        least = best.nats - settings.SELECTION.margin
+        rivals = tuple(other.label for other, _ in others if other.nats > least)
+        laws.append(replace(best, rivals=rivals))
+    base, laws = search.doubted(base, laws)
+    # Who judged has no more say: the numbers are those of all records.
+    every = replace(search, train=[*train, *held])
+    final = every.fit(base.model, base.said.values)
+    taken_up = {law.label for law in laws}
+    laws = [
+        replace(
+            law, parameters=every.sizes(final, law.label),
+            rivals=tuple(label for label in law.rivals if label not in taken_up),
+        )
+        for law in laws
+    ]  # fmt: skip
+    stated, identified, extended = (
+        _relative(m, held) for m in (plain, nominal.standing, base.standing)
+    )
+    return TorqueSelection(
+        tuple(model.mechanism.coordinates), stated, identified, extended, tuple(laws),
+        tuple(law for law, _ in judged if law.reason), final.standing,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A structure, what the torques of some records say of it, and what it leaves in all.
+
+    Attributes:
+        model: With the numbers of the file.
+        said: The torque fit.
+        train: Torque errors of each record fitted to, shape (rows, n).
+        held: The same of those held out.
+    """
+
+    model: Model
+    said: TorqueFit
+    train: list[np.ndarray]
+    held: list[np.ndarray]
+
+    @property
+    def standing(self) -> Model:
+        """The model with the numbers that the torques say."""
+        return self.model.with_values(self.said.values)
+
+    def independent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Independent ones among the torques of the records fitted to: number and share, (n,)."""
+        weighted = [rows / row_scale(rows, self.said.scale) for rows in self.train]
+        steps = [STRIDE_S] * len(weighted)
+        number = np.array([
+            independent_samples([rows[:, [k]] for rows in weighted], steps)
+            for k in range(len(self.said.scale))
+        ])  # fmt: skip
+        count = np.isfinite(np.vstack(weighted)).sum(axis=0)
+        return number, number / np.maximum(count, number)
+
+    @property
+    def deviance(self) -> np.ndarray:
+        """(T) of the records fitted to, of each coordinate, (n,)."""
+        return deviance_by_column(np.vstack(self.train))
+
+    @property
+    def disbelief(self) -> float:
+        """Squared distance of the numbers from what the file believes, in its tolerances."""
+        return self.said.deviance - float(self.deviance.sum())
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Fits and judgements on one split of the records."""
+
+    train: Sequence[DataSet]
+    held: Sequence[DataSet]
+    names: Sequence[str] | None
+    carry_out: CarryOut
+
+    def fit(self, model: Model, at: Mapping[str, float]) -> _Fitted:
+        """A structure fitted by torques, from given values."""
+        said = torque_error.fit_by_torque(model, self.train, at=at)
+        if said is None:
+            raise IdentificationError(
+                'no torques can be compared: the recordings are shorter than a quarter of a '
+                'second, or positions are missing in all of them'
+            )
+        return self._with_errors(model, said)
+
+    def _with_errors(self, model: Model, said: TorqueFit) -> _Fitted:
+        standing = model.with_values(said.values)
+        train, held = (
+            torque_error.left_by(standing, records) for records in (self.train, self.held)
+        )
+        if not held:
+            raise IdentificationError(
+                'no torques to judge by: the recordings held out are shorter than a quarter of a '
+                'second, or positions are missing in all of them'
+            )
+        return _Fitted(model, said, train, held)
+
+    def on_top(self, base: _Fitted) -> list[tuple[Law, _Fitted]]:
+        """Effects on top of a base, fitted and judged: those that the scores promise most of."""
+        setups = [data_set.setup for data_set in (*self.train, *self.held)]
+        recorded = {name for data_set in self.train for name in data_set.input_names}
+        candidates = [
+            candidate
+            for candidate in candidates_for(base.model, setups, self.names, recorded)
+            if _told_by_torques(base.model, candidate)
+        ]
+        found = scores(
+            base.model, self.train, candidates, {}, self.carry_out,
+            numbers=base.said.values, most=FITTED,
+        )  # fmt: skip
+        judged = []
+        for model, said in found.extended.values() if found else ():
+            there = self._with_errors(model, said)
+            judged.append((self._law(base, there, model.effects[-1].label), there))
+        return sorted(judged, key=lambda pair: -pair[0].nats)
+
+    def _law(self, without: _Fitted, with_it: _Fitted, label: str) -> Law:
+        """What an effect gains, and whether that is worth it (diagnosis.md, section 4)."""
+        sizes = self.sizes(with_it, label)
+        number, share = with_it.independent()
+        gained = share @ (without.deviance - with_it.deviance) / 2
+        gained += (without.disbelief - with_it.disbelief) / 2
+        nats = gained - len(sizes) / 2 * np.log(number.sum())
+        # Rows in which friction turns are far off with any law: they count as (T) has it.
+        before, after = (
+            [np.sqrt(deviances(rows, without.said.scale)) for rows in fitted.held]
+            for fitted in (without, with_it)
+        )
+        significance = block_gain(before, after, round(block_s(self.held) / STRIDE_S))
+        left, was = (scale_of(np.vstack(fitted.held)) for fitted in (with_it, without))
+        taken = 1 - (left / was) ** 2
+        return Law(
+            label, float(nats), significance, taken, sizes,
+            reason='; '.join(_shortcomings(float(nats), significance, taken, sizes)),
+        )  # fmt: skip
+
+    def sizes(self, fitted: _Fitted, label: str) -> Sizes:
+        """An effect's numbers, with standard deviations by the curvature of (T) and by belief."""
+        values, own = fitted.said.values, f'{label}.'
+        unknowns = tuple(u for u in unknowns_of(fitted.model) if u.name in values)
+        problems = torque_error.problems_of(fitted.model, self.train, unknowns)
+        theta = np.array([u.to_coordinate(values[u.name]) for u in unknowns])
+        scale = np.nan_to_num(row_scale(np.vstack(fitted.train), fitted.said.scale), nan=1.0)
+        _, share = fitted.independent()
+        j = torque_error.derivatives(problems, unknowns, theta) / scale[:, :, None]
+        j = (np.sqrt(share)[:, None] * j).reshape(-1, len(unknowns))
+        curvature = j.T @ j + np.diag([1 / u.tolerance**2 for u in unknowns])
+        seen = np.diag(curvature) > 0
+        steep = np.sqrt(np.diag(curvature)[seen])
+        scaled = curvature[np.ix_(seen, seen)] / np.outer(steep, steep)
+        sigmas = np.full(len(unknowns), np.inf)
+        sigmas[seen] = np.sqrt(np.diag(np.linalg.inv(scaled + LOST * np.eye(len(steep))))) / steep
+        return {
+            u.name.removeprefix(own): (
+                values[u.name], float(sigma) * (values[u.name] if u.logarithmic else 1.0), u.unit
+            )
+            for u, sigma in zip(unknowns, sigmas, strict=True) if u.name.startswith(own)
+        }  # fmt: skip
+
+    def doubted(self, base: _Fitted, laws: Sequence[Law]) -> tuple[_Fitted, list[Law]]:
+        """Without those laws that the others do without; what each gains beside the others."""
+        laws = list(laws)
+        while len(laws) > 1:
+            models = [base.model.without_effect(law.label) for law in laws]
+            said = self.carry_out(
+                torque_error.fit_by_torque,
+                [(model, self.train, None, None, base.said.values) for model in models],
+                'each law beside the others',
+            )
+            lean = [self._with_errors(m, fit) for m, fit in zip(models, said, strict=True)]
+            judged = [self._law(fit, base, law.label)
+                      for fit, law in zip(lean, laws, strict=True)]  # fmt: skip
+            idle = [k for k, law in enumerate(judged) if law.reason]
+            if not idle:
+                return base, [
+                    replace(again, rivals=law.rivals)
+                    for again, law in zip(judged, laws, strict=True)
+                ]
+            least = min(idle, key=lambda k: lean[k].said.deviance)
+            base = lean[least]
+            del laws[least]
+        return base, laws
+
+
+def _shortcomings(nats: float, significance: float, taken: np.ndarray, sizes: Sizes) -> list[str]:
+    """Why what an effect gains is not worth it."""
+    found = []
+    if nats < settings.SELECTION.earned:
+        found.append(f'evidence {nats:.1f} nats, {settings.SELECTION.earned:g} needed')
+    if significance < settings.SELECTION.significant:
+        found.append('no significant gain on recordings held out')
+    if np.nanmax(taken) < MATERIAL:
+        found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
+    for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
+        if abs(size) < settings.SELECTION.too_small * sigma:
+            found.append(f'{name} = {measured(size, sigma, unit)} may be none')
+    return found
+
+
+def _told_by_torques(model: Model, candidate: EffectAt) -> bool:
+    """Whether smoothed torques can tell of an effect: it has no states, is no sensor, no event."""
+    name, at = candidate
+    effect = LIBRARY[name](model.mechanism, at)
+    return not (
+        effect.states or effect.place in ('sensor', 'timing')
+        or any(p.each for p in effect.parameters)
+    )  # fmt: skip
+
+
+def _relative(model: Model, data_sets: Sequence[DataSet]) -> np.ndarray:
+    """Torque error of a model as it is over the torque that acted, shape (n,)."""
+    found = torque_error.fit_by_torque(model, data_sets, only=())
+    assert found is not None  # its errors are known
+    return found.relative

@@ -1,0 +1,176 @@
+"""Which laws the torques of a robot lack, told without a simulation."""
+
+import json
+
+import numpy as np
+import pytest
+from hanging_arm import nominal, recorded
+
+from cg_dynamics.model import Model
+from cg_dynamics.rig import Setup
+from cg_sysid.cli.torques import main
+from cg_sysid.diagnosis.diagnose import Options, diagnose
+from cg_sysid.identification.data_set import prepare
+from cg_sysid.identification.joint_friction import friction_of
+from cg_sysid.identification.torque_error import fit_by_torque
+from cg_sysid.identification.unknowns import IdentificationError
+from cg_sysid.records.bags import write_bag
+from cg_sysid.search.torque_selection import select
+
+OFF = {
+    'thigh_mass': 1.12, 'shank_mass': 0.9, 'coulomb_friction@hip_joint.torque': 0.3,
+    'viscous_friction@shank_joint.coefficient': 0.16, 'coulomb_friction@thigh_joint.torque': 0.11,
+}  # fmt: skip
+STRIBECK = ('stribeck_friction', 'thigh_joint', {'torque': 0.3, 'stribeck_rate': 0.4})
+RIPPLE = ('cogging_torque', 'hip_joint', {'amplitude': 0.2, 'cycles': 12.0, 'phase': 0.7})
+SECONDS = 6.0
+FREE = (Setup(),) * 4
+SHANK = Setup(locked=(('shank_joint', 0.3),))
+LEG = Setup(locked=(('hip_joint', -0.2), ('thigh_joint', 0.4)))
+
+
+@pytest.fixture(scope='module')
+def believed():
+    return nominal()
+
+
+def machine(believed, *hidden):
+    true = believed.with_values(OFF)
+    for name, at, sizes in hidden:
+        known = {p.name for p in true.with_effect(name, at).effects[-1].parameters}
+        assert set(sizes) <= known
+        true = true.with_effect(name, at, **sizes)
+    return true
+
+
+def ways(machine, believed, setups=FREE):
+    found = prepare(believed, [recorded(machine, SECONDS, k, s) for k, s in enumerate(setups)])
+    return found[0::2], found[1::2]
+
+
+def test_two_laws_of_two_joints_are_taken_up_with_their_sizes(believed):
+    train, held = ways(machine(believed, STRIBECK, RIPPLE), believed)
+    found = select(believed, train, held)
+    assert {law.label for law in found.laws} == {
+        'stribeck_friction@thigh_joint', 'cogging_torque@hip_joint'
+    }  # fmt: skip
+    sizes = {law.label: law.parameters for law in found.laws}
+    # Biased by smoothing over 0.12 s, in which friction turns, as all torque fits are.
+    value, sigma, unit = sizes['cogging_torque@hip_joint']['amplitude']
+    assert value == pytest.approx(0.2, abs=0.02)
+    assert 0 < sigma < 0.02
+    assert unit == 'N m'
+    value, sigma, _ = sizes['stribeck_friction@thigh_joint']['torque']
+    assert value == pytest.approx(0.3, rel=0.3)
+    assert 0 < sigma < 0.1
+    hip, thigh, _ = range(3)
+    assert found.coordinates == ('hip_joint', 'thigh_joint', 'shank_joint')
+    assert found.identified[hip] < found.stated[hip]
+    for k in (hip, thigh):
+        assert found.extended[k] < 0.9 * found.identified[k]
+    assert {e.label for e in found.model.effects} > set(sizes)
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_sound_arm_has_none(believed, seed):
+    records = [recorded(machine(believed), SECONDS, 10 * seed + k) for k in range(4)]
+    data_sets = prepare(believed, records)
+    found = select(believed, data_sets[0::2], data_sets[1::2])
+    assert not found.laws
+    assert np.array_equal(found.identified, found.extended)
+
+
+def test_only_those_asked_for_are_taken_up(believed):
+    train, held = ways(machine(believed, RIPPLE), believed)
+    assert not select(believed, train, held, ['torque_bias']).laws
+    (law,) = select(believed, train, held, ['cogging_torque@hip_joint', 'payload']).laws
+    assert law.label == 'cogging_torque@hip_joint'
+
+
+def test_recordings_with_different_joints_locked_go_together(believed):
+    setups = (SHANK, SHANK, LEG, LEG)
+    true = machine(believed, STRIBECK)
+    train, held = ways(true, believed, setups)
+    plain = fit_by_torque(believed, train)
+    # Of the joints that only some recordings move, what those say.
+    assert plain.values['viscous_friction@shank_joint.coefficient'] == pytest.approx(0.16, rel=0.1)
+    assert plain.values['coulomb_friction@hip_joint.torque'] == pytest.approx(0.3, rel=0.1)
+    (law,) = select(believed, train, held).laws
+    assert law.label == 'stribeck_friction@thigh_joint'
+    # A joint that is locked in all of them has no torque error.
+    alone = fit_by_torque(believed, train[:1])
+    assert list(np.isnan(alone.relative)) == [False, False, True]
+
+
+def test_a_diagnosis_takes_them_together_too(believed):
+    setups = (SHANK, SHANK, LEG, LEG)
+    true = machine(believed, STRIBECK)
+    records = [recorded(true, 4.0, k, setup) for k, setup in enumerate(setups)]
+    found = diagnose(believed, records, Options(effects=('stribeck_friction',)))
+    assert [cause.label for cause in found.causes] == ['stribeck_friction@thigh_joint']
+    value, sigma, _ = found.causes[0].parameters['torque']
+    assert value == pytest.approx(0.3, abs=max(4 * sigma, 1e-3))
+    assert found.extended.held.normalised_error < 1.3
+
+
+def test_a_mechanism_with_equations_of_its_own_is_no_robot_of_a_urdf():
+    model = Model.load('compass_gait_mit')
+    with pytest.raises(IdentificationError, match='robot of a URDF with an encoder'):
+        select(model, [], [])
+
+
+def test_from_bags_to_the_model_with_its_laws(believed, tmp_path, capsys):
+    true = machine(believed, RIPPLE)
+    bags = [str(write_bag(tmp_path / f'way_{k}', recorded(true, SECONDS, k))) for k in range(3)]
+    believed.save(tmp_path / 'leg.yaml')
+    out = tmp_path / 'answer'
+    command = ['--model', str(tmp_path / 'leg.yaml'), '--out', str(out), '--workers', '1']
+    assert main([*command, '--held', 'way_1', *bags]) == 0
+    facts = json.loads((out / 'torques.json').read_text())
+    assert facts['format'] == 'cg_torques/1'
+    assert facts['held'] == ['way_1']
+    assert facts['train'] == ['way_0', 'way_2']
+    assert [law['label'] for law in facts['laws']] == ['cogging_torque@hip_joint']
+    assert facts['joints']['hip_joint']['extended'] < facts['joints']['hip_joint']['identified']
+    extended = Model.load(out / 'model.yaml')
+    assert extended.values['cogging_torque@hip_joint.amplitude'] == pytest.approx(0.2, abs=0.02)
+    assert (out / 'friction.png').read_bytes().startswith(b'\x89PNG')
+    said = capsys.readouterr().out
+    assert 'cogging torque (hip joint): amplitude = 0.19' in said
+    assert f'cg diagnose --model {out / "model.yaml"}' in said
+
+
+def test_what_opposes_a_joint_is_its_friction(believed):
+    true = machine(believed, STRIBECK)
+    data_sets = ways(true, believed)[0]
+    thigh = friction_of(true, data_sets)['thigh_joint']
+    moving = np.abs(thigh.rate) > 0.3  # where friction turns within a window it is off
+    p = true.values
+    law = p['viscous_friction@thigh_joint.coefficient'] * thigh.rate
+    law += np.sign(thigh.rate) * p['coulomb_friction@thigh_joint.torque']
+    law += (
+        np.sign(thigh.rate)
+        * p['stribeck_friction@thigh_joint.torque']
+        * np.exp(-((thigh.rate / p['stribeck_friction@thigh_joint.stribeck_rate']) ** 2))
+    )
+    # Smoothing over 0.12 s bends it, and the drive's torque of some 3 N m leaves a little.
+    assert np.median(np.abs(thigh.measured - law)[moving]) < 0.03
+    assert np.median(np.abs(thigh.modelled - law)[moving]) < 0.02
+    locked = prepare(believed, [recorded(true, SECONDS, 1, SHANK)])
+    assert set(friction_of(true, locked)) == {'hip_joint', 'thigh_joint'}
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (['--effects', 'magic'], "no effect 'magic'"),
+        (['--held', 'nothing*'], 'matches no record'),
+        (['--workers', '-1'], 'must not be negative'),
+    ],
+)
+def test_a_wrong_option_is_named(believed, tmp_path, capsys, options, message):
+    bag = str(write_bag(tmp_path / 'way', recorded(believed, 1.0, 1)))
+    believed.save(tmp_path / 'leg.yaml')
+    command = ['--model', str(tmp_path / 'leg.yaml'), '--out', str(tmp_path / 'answer')]
+    assert main([*command, *options, bag]) == 2
+    assert message in capsys.readouterr().err
