@@ -19,7 +19,13 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from cg_dynamics.assemble import Equations, acting_effects, assemble, parameter_vector
+from cg_dynamics.assemble import (
+    Equations,
+    acting_effects,
+    assemble,
+    overrides,
+    parameter_vector,
+)
 from cg_dynamics.effects import Effect
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -378,29 +384,58 @@ def problems_of(
         places = [names.index(u.name) for u in unknowns]
         own_places = [k for k in places if k < e.p.shape[0]]
         moved = ca.vertcat(*(e.p[k] for k in own_places)) if own_places else ca.SX(0, 1)
-        balance = _balance(plain, e, setup)
+        vector, acted = _vector(model, setup), _acted(plain, e, every)
+        balance = _balance(plain, e, setup, np.sqrt(np.mean(acted**2, axis=0)))
         error, slope = (
             AlongRows(e, every, ca.densify(x)) for x in (balance, ca.jacobian(balance, moved))
         )
-        vector, acted = _vector(model, setup), _acted(plain, e, every)
         moving = plain.mechanism.kinematics(setup).names
         free = np.array([name in moving for name in plain.mechanism.coordinates])
         found.append(Problem(e, error, slope, every, vector, places, acted, free, followed))
     return found
 
 
-def _balance(model: Model, e: Equations, setup: Setup) -> ca.SX:
-    """(TE), of what nothing drives as an error of its acceleration, times the inertia believed.
+def _balance(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.SX:
+    """(TE) in units of what was measured.
 
-    There all terms grow with the masses: that nothing weighs anything would leave no error.
+    Of what a drive moves that is the torque that it reports: that it delivers nothing, and nothing
+    weighs anything, would leave no error. Of what nothing drives it is the acceleration, times the
+    inertia believed, as there all terms grow with the masses.
+
+    Args:
+        model: Without states.
+        e: Its equations.
+        setup: The set-up.
+        typical: Torque on each free coordinate, N m (N), shape (m,).
     """
     own = ca.diag(e.mass_matrix)
     believed = ca.substitute(own, e.p, parameter_vector(model, setup))
-    driven = np.any(_driving(model, setup) != 0, axis=0)
-    return ca.vertcat(*(
-        e.imbalance[k] if driven[k] else e.imbalance[k] * believed[k] / own[k]
-        for k in range(e.coordinates)
-    ))  # fmt: skip
+    driving = _driving(model, setup) != 0
+    rows = []
+    for k in range(e.coordinates):
+        drives = [joint for joint, on in zip(model.mechanism.joints, driving[:, k], strict=True)
+                  if on]  # fmt: skip
+        if not drives:
+            rows.append(e.imbalance[k] * believed[k] / own[k])
+        elif len(drives) == 1 and typical[k] > 0:
+            rows.append(e.imbalance[k] / _delivered(model, e, drives[0], float(typical[k])))
+        else:
+            rows.append(e.imbalance[k])
+    return ca.vertcat(*rows)
+
+
+def _delivered(model: Model, e: Equations, joint: str, typical: float) -> ca.SX:
+    """What the drive of a joint delivers of a torque that it reports, [1]."""
+    symbols = dict(zip(e.parameter_names, ca.vertsplit(e.p), strict=True))
+
+    def through(torque: ca.SX) -> ca.SX:
+        for effect in acting_effects(model):
+            if effect.site == joint and overrides(effect, 'deliver'):
+                own = {q.name: symbols[f'{effect.label}.{q.name}'] for q in effect.parameters}
+                torque, _ = effect.deliver(torque, [], own)
+        return torque
+
+    return (through(ca.SX(typical)) - through(ca.SX(-typical))) / (2 * typical)
 
 
 def _vector(model: Model, setup: Setup) -> np.ndarray:

@@ -251,7 +251,8 @@ class _Search:
         sizes = self.sizes(with_it, label)
         number, share = with_it.independent()
         gained = share @ (without.deviance - with_it.deviance) / 2
-        gained += (without.disbelief - with_it.disbelief) / 2
+        relieved = (without.disbelief - with_it.disbelief) / 2
+        gained += relieved
         nats = gained - len(sizes) / 2 * np.log(number.sum())
         # Rows in which friction turns are far off with any law: they count as (T) has it.
         before, after = (
@@ -263,7 +264,7 @@ class _Search:
         taken = 1 - (left / was) ** 2
         return Law(
             label, float(nats), significance, taken, sizes,
-            reason='; '.join(_shortcomings(float(nats), significance, taken, sizes)),
+            reason='; '.join(_shortcomings(float(nats), significance, taken, sizes, relieved)),
         )  # fmt: skip
 
     def sizes(self, fitted: _Fitted, label: str) -> Sizes:
@@ -314,14 +315,21 @@ class _Search:
         return base, laws
 
 
-def _shortcomings(nats: float, significance: float, taken: np.ndarray, sizes: Sizes) -> list[str]:
-    """Why what an effect gains is not worth it."""
+def _shortcomings(
+    nats: float, significance: float, taken: np.ndarray, sizes: Sizes, relieved: float
+) -> list[str]:
+    """Why what an effect gains is not worth it.
+
+    What takes the place of numbers that nobody believes, as a payload that of a link too heavy,
+    lowers no error: by these it is relieved of so many nats.
+    """
     found = []
     if nats < settings.SELECTION.earned:
         found.append(f'evidence {nats:.1f} nats, {settings.SELECTION.earned:g} needed')
-    if significance < settings.SELECTION.significant:
+    believed = relieved > settings.SELECTION.earned
+    if significance < (0.0 if believed else settings.SELECTION.significant):
         found.append('no significant gain on recordings held out')
-    if np.nanmax(taken) < MATERIAL:
+    if np.nanmax(taken) < MATERIAL and not believed:
         found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
     for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
         if abs(size) < settings.SELECTION.too_small * sigma:
