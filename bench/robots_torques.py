@@ -3,8 +3,9 @@
     ./cg exec python bench/robots_torques.py [PATTERN ...]     such as 'arm6:*'
         [--raw FILE] [--write bench/results/robots_torques.md]
 
-The same machines and bags as there, whole, with all recordings at all cores, and no simulation. A
-case is one of three kinds, settled by what is hidden before any was run:
+The same machines and bags as there, whole, and no simulation. Each case has one core, and as many
+run side by side as there are. A case is one of three kinds, settled by what is hidden before any
+was run:
 
     told        by torques: a law of a joint, a body, a drive. Right: the first law that is taken
                 up is that at that place, or another that robots_machines.right says is the same.
@@ -14,22 +15,19 @@ case is one of three kinds, settled by what is hidden before any was run:
 """
 
 import argparse
-import json
 import os
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from outside import wilson
+from case_rows import known_rows, with_missing
+from outside import cpu_seconds, wilson
 from robots import ROOT, Case, labels, made, programme, version
 
 from cg_dynamics.model import Model
-from cg_sysid import parallel
 from cg_sysid.checks.loading import load_bags
 from cg_sysid.diagnosis.diagnose import split
 from cg_sysid.identification.data_set import prepare
@@ -49,21 +47,16 @@ def kind_of(effect: str) -> str:
     return 'not asked' if effect in NOT_ASKED else 'told'
 
 
-def carry_out(function: Callable, arguments: list[tuple], what: str) -> list:
-    """On all cores."""
-    return parallel.run_all(function, arguments)
-
-
-def run(case: Case, of: str) -> dict[str, Any]:
+def run(case: Case, of: str, limit: float) -> dict[str, Any]:
     """One line of the raw results."""
     with tempfile.TemporaryDirectory() as folder:
         model_file, bags, values = made(case, Path(folder))
-        began = time.monotonic()
+        began = cpu_seconds()
         loaded = load_bags(bags, model_file, whole=True)
         model = Model.load(model_file)
         train, held = split(prepare(model, loaded.records))
-        found = select(model, train, held, carry_out=carry_out)
-        seconds = time.monotonic() - began
+        found = select(model, train, held)
+        seconds = cpu_seconds() - began
     return {
         'case': case.name, 'robot': case.robot, 'effect': case.effect, 'site': case.site,
         'faults': case.faults, 'hard': case.hard, 'right': labels(case), 'values': values,
@@ -85,16 +78,16 @@ def is_right(row: dict[str, Any]) -> bool:
 def table_of(rows: list[dict[str, Any]]) -> list[str]:
     """By robot and kind, then every case."""
     lines = [
-        '| robot | hidden | cases | right | 95 % interval | further laws | s: median | longest |',
+        '| robot | hidden | cases | right | 95 % interval | further laws | CPU s: median '
+        '| longest |',
         '|---|---|---:|---:|---:|---:|---:|---:|',
     ]
     for robot in (*dict.fromkeys(row['robot'] for row in rows), 'all'):
         for kind in KINDS:
             own = [
-                row
-                for row in rows
+                row for row in rows
                 if robot in (row['robot'], 'all') and kind_of(row['effect']) == kind
-            ]
+            ]  # fmt: skip
             if not own:
                 continue
             correct = sum(map(is_right, own))
@@ -105,7 +98,7 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
                 f'| {robot} | {kind} | {len(own)} | {correct} | {low:.0%} to {high:.0%} '
                 f'| {further} | {np.median(spent):.0f} | {max(spent):.0f} |'
             )
-    lines += ['', '| case | where | small faults | laws (rivals) | right | s |',
+    lines += ['', '| case | where | small faults | laws (rivals) | right | CPU s |',
               '|---|---|---|---|---|---:|']  # fmt: skip
     for row in rows:
         laws = '; '.join(
@@ -120,6 +113,12 @@ def table_of(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
+def told(row: dict[str, Any]) -> str:
+    """A row for the screen."""
+    words = row['case'], row['site'], '->', *row['laws'], '' if is_right(row) else 'WRONG'
+    return ' '.join([*words, f'{row["seconds"]:.0f} s'])
+
+
 def main() -> int:
     """Run what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -128,26 +127,17 @@ def main() -> int:
     parser.add_argument('--write', type=Path)
     options = parser.parse_args()
     of = version()
-    known = {}
-    if options.raw.exists():
-        rows = map(json.loads, options.raw.read_text().splitlines())
-        known = {row['case']: row for row in rows if row['version'] == of}
     cases = [c for c in programme() if any(fnmatch(c.name, p) for p in options.patterns)]
-    for case in cases:
-        if case.name in known:
-            continue
-        row = known[case.name] = run(case, of)
-        with options.raw.open('a') as file:
-            file.write(json.dumps(row) + '\n')
-        print(case.name, case.site, '->', *row['laws'], '' if is_right(row) else 'WRONG',
-              f'{row["seconds"]:.0f} s', flush=True)  # fmt: skip
+    found = with_missing(
+        known_rows(options.raw, of), cases, run, of, options.raw, os.cpu_count() or 1, np.inf, told
+    )
     lines = [
         '# Laws by torques alone, of robots that share no code with the models',
         '',
         'Command: `./cg exec python bench/robots_torques.py`. What counts as right stands at the '
-        f'head of the bench. Sources {of}, {os.cpu_count()} cores.',
+        f'head of the bench. Sources {of}.',
         '',
-        *table_of([known[case.name] for case in cases]),
+        *table_of([found[case.name] for case in cases]),
     ]
     text = '\n'.join(lines) + '\n'
     print(text)
