@@ -37,7 +37,7 @@ from cg_sysid.search.torque_selection import Law, TorqueSelection, select
 from cg_sysid.text import effect_name, listed, measured, number
 
 FORMAT = 'cg_torques/1'
-TURNED_DOWN = 3  # that are named, the best
+TURNED_DOWN = 3  # that are named, the best of those with any evidence
 NAMED = 0.03  # of the squared torque error: a joint where a law takes less is not named
 
 Facts = dict[str, Any]
@@ -194,7 +194,7 @@ def show(console: Console, found: TorqueSelection, directory: Path, quiet: bool)
     if not quiet:
         for law in found.laws:
             _show_law(console, law, found.coordinates)
-        for law in found.turned_down[:TURNED_DOWN]:
+        for law in [law for law in found.turned_down if law.nats > 0][:TURNED_DOWN]:
             console.print(
                 f'  not taken up: {effect_name(law.label)}: {law.reason}', highlight=False
             )
