@@ -160,9 +160,22 @@ def test_what_opposes_a_joint_is_its_friction(believed):
     assert set(friction_of(true, locked)) == {'hip_joint', 'thigh_joint'}
 
 
+def test_one_recording_is_halved(believed, tmp_path):
+    bag = write_bag(tmp_path / 'way', recorded(machine(believed, RIPPLE), 2 * SECONDS, 1))
+    believed.save(tmp_path / 'leg.yaml')
+    out = tmp_path / 'answer'
+    command = ['--model', str(tmp_path / 'leg.yaml'), '--out', str(out), '--workers', '1']
+    assert main([*command, '--effects', 'cogging_torque', str(bag)]) == 0
+    facts = json.loads((out / 'torques.json').read_text())
+    assert [law['label'] for law in facts['laws']] == ['cogging_torque@hip_joint']
+    assert len(facts['train']) == len(facts['held']) == 1
+    assert facts['train'] != facts['held']
+
+
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
+        (['--effects', 'sensor_delay,backlash'], 'torques alone cannot tell of sensor_delay'),
         (['--effects', 'magic'], "no effect 'magic'"),
         (['--held', 'nothing*'], 'matches no record'),
         (['--workers', '-1'], 'must not be negative'),

@@ -77,7 +77,10 @@ def work(options: argparse.Namespace) -> int:
         if not loaded.records:
             first = loaded.left_out[0]
             raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
-        train, held = split(prepare(model, loaded.records), cli.records_held(options.held, loaded))
+        records = loaded.records
+        if len(records) == 1:  # nothing has to be followed from the start of a half
+            records = tuple(records[0].segments(records[0].duration / 2))
+        train, held = split(prepare(model, records), cli.records_held(options.held, loaded))
 
         def carry_out(function: Callable, arguments: list[tuple], what: str) -> list:
             return run_all(

@@ -121,6 +121,12 @@ def select(
         )
     search = _Search(train, held, names, carry_out)
     plain = torque_error.without_states(model)
+    bare = replace(plain, effects=())
+    if names is not None and not search.candidates(bare):
+        raise IdentificationError(
+            f'torques alone cannot tell of {", ".join(names)}: they know little of sensors and '
+            'delays, and nothing of pushes and of what moves by itself; use cg diagnose'
+        )
     nominal = base = search.fit(plain, {})
     laws: list[Law] = []
     while True:
@@ -227,17 +233,20 @@ class _Search:
             )
         return _Fitted(model, said, train, held)
 
-    def on_top(self, base: _Fitted) -> list[tuple[Law, _Fitted]]:
-        """Effects on top of a base, fitted and judged: those that the scores promise most of."""
+    def candidates(self, model: Model) -> list[EffectAt]:
+        """Effects that may be taken up on top of a model."""
         setups = [data_set.setup for data_set in (*self.train, *self.held)]
         recorded = {name for data_set in self.train for name in data_set.input_names}
-        candidates = [
+        return [
             candidate
-            for candidate in candidates_for(base.model, setups, self.names, recorded)
-            if _told_by_torques(base.model, candidate)
+            for candidate in candidates_for(model, setups, self.names, recorded)
+            if _told_by_torques(model, candidate)
         ]
+
+    def on_top(self, base: _Fitted) -> list[tuple[Law, _Fitted]]:
+        """Effects on top of a base, fitted and judged: those that the scores promise most of."""
         found = scores(
-            base.model, self.train, candidates, {}, self.carry_out,
+            base.model, self.train, self.candidates(base.model), {}, self.carry_out,
             numbers=base.said.values, most=FITTED,
         )  # fmt: skip
         judged = []
