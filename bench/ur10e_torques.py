@@ -32,8 +32,6 @@ from cg_sysid.report import friction_picture
 from cg_sysid.search.torque_selection import Law, TorqueSelection, select
 from cg_sysid.text import listed, measured
 
-NAMED = 0.03  # of the squared torque error: a joint where a law takes less is not named
-
 
 def carry_out(function: Callable, arguments: list[tuple], what: str) -> list:
     """On all cores."""
@@ -49,7 +47,7 @@ def shares(found: TorqueSelection, law: Law) -> str:
     """What a law takes of the squared error, by joint."""
     return listed([
         f'{share:.0%} {joint.removesuffix("_joint")}'
-        for joint, share in zip(found.coordinates, law.taken, strict=True) if share > NAMED
+        for joint, share in found.shares(law).items()
     ])  # fmt: skip
 
 

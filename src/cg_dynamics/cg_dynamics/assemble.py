@@ -36,6 +36,7 @@ class Equations:
         mass_matrix: Of the free coordinates.
         load: Generalised forces less bias, so that mass_matrix times acceleration is load: (m, 1).
         acceleration: Symbol of an acceleration of the free coordinates, (m, 1).
+        torques: What drives and friction do on each free coordinate, a part of `load`: (m, 1).
         imbalance: Generalised forces less what that acceleration takes; 0 of the true one: (m, 1).
         energy: Kinetic plus potential energy of bodies and springs in J.
         state_names: Names of x.
@@ -58,6 +59,7 @@ class Equations:
     mass_matrix: ca.SX
     load: ca.SX
     acceleration: ca.SX
+    torques: ca.SX
     imbalance: ca.SX
     energy: ca.SX
     state_names: tuple[str, ...]
@@ -123,7 +125,8 @@ def parameter_vector(model: Model, setup: Setup) -> np.ndarray:
 def assemble(model: Model, setup: Setup) -> Equations:
     """Build the equations of a model in a set-up; only acting effects take part."""
     made = _Assembly(model, setup)
-    dynamics = made.dynamics(made.torques())
+    torques = made.torques()
+    dynamics = made.dynamics(torques)
     acceleration = solve_small(dynamics.mass_matrix, dynamics.load)
     outputs = made.readings()
     input_delay, output_delays = made.delays(outputs)
@@ -140,6 +143,7 @@ def assemble(model: Model, setup: Setup) -> Equations:
         mass_matrix=dynamics.mass_matrix,
         load=dynamics.load,
         acceleration=dynamics.acceleration,
+        torques=ca.mtimes(made.joint_rows.T, ca.vertcat(*torques)),
         imbalance=dynamics.imbalance,
         energy=dynamics.energy,
         state_names=(*names, *(f'd{name}/dt' for name in names), *made.extra_states),
@@ -208,6 +212,9 @@ class _Assembly:
         self.settled: dict[str, list[ca.SX]] = {}
         # All coordinates and their rates: symbols, and what they are in free ones.
         coordinates = self.kinematics.basis.shape[0]
+        # Angle of each joint, by the free coordinates.
+        joints = ca.DM([list(row) for row in self.mechanism.all_joints.values()])
+        self.joint_rows = ca.mtimes(joints, self.kinematics.basis)
         self.q, self.v = ca.SX.sym('q', coordinates), ca.SX.sym('v', coordinates)
         self.full = [
             ca.mtimes(self.kinematics.basis, self.s) + self.kinematics.offset,

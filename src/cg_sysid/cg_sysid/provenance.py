@@ -2,7 +2,7 @@
 
 import hashlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -32,6 +32,33 @@ def provenance(
         'command': list(command),
         'options': dict(options),
         'software': software(),
+    }
+
+
+def of_model(
+    made_by: str,
+    origin: Mapping[str, Any],
+    parent: Mapping[str, Any],
+    records: Iterable[Mapping[str, Any]],
+    **more: Any,
+) -> dict[str, Any]:
+    """Provenance of a model that was made of another one and of recordings.
+
+    Args:
+        made_by: Command that made it.
+        origin: Of the result (provenance()).
+        parent: Provenance of the model that it was made of.
+        records: Those that were used: 'name' and 'sha256'; other fields are left out.
+        more: What else is to be told.
+    """
+    return {
+        'made_by': made_by,
+        'created': origin['created'],
+        'parent': Path(origin['model_file']).name,
+        'parent_sha256': origin['model_sha256'],
+        **more,
+        'records': [{'name': s['name'], 'sha256': s['sha256']} for s in records],
+        'parent_provenance': dict(parent),
     }
 
 

@@ -20,6 +20,7 @@ from cg_sysid.identification.simulation_error import attempt
 from cg_sysid.search import settings
 from cg_sysid.search.look import first_seconds, screen
 from cg_sysid.search.outcome import own_parameters
+from cg_sysid.search.starts import starts_beside
 from cg_sysid.search.task import Task
 from cg_sysid.search.whole_fit import try_candidate
 
@@ -76,6 +77,21 @@ def test_no_step_of_a_drive_lies_far_from_where_a_fit_sets_out(model_file):
     assert (min(within), max(within)) == (pytest.approx(2), pytest.approx(40))
     # Where an edge is off by half a step the response to it has lost its sign.
     assert np.diff(within) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(('name', 'parameter'), [('torque_saturation', 'limit'),
+                                                  ('torque_quantisation', 'step')])  # fmt: skip
+def test_starts_by_torque_lie_below_the_largest_and_in_range(model_file, name, parameter):
+    nominal = Model.load(model_file)
+    effect = LIBRARY[name](nominal.mechanism)
+    ((high, low),) = [(p.upper, p.lower) for p in effect.parameters if p.name == parameter]
+    data_set = prepare(nominal, [_record(nominal, 1)])[0]
+    for largest in (5.0, 700.0, 5e4):
+        torque = largest * data_set.inputs / np.abs(data_set.inputs).max()
+        starts = starts_beside(effect, nominal.mechanism, [replace(data_set, inputs=torque)])
+        sizes = [start[parameter] for start in starts]
+        assert sizes
+        assert all(low <= size <= min(high, largest) for size in sizes)
 
 
 @pytest.mark.parametrize('phase', [4.4, -4.0, 0.7])

@@ -5,6 +5,7 @@ import casadi as ca
 from cg_dynamics.effects.effect import Effect
 from cg_dynamics.parameter import Parameter
 
+CLIPPED = 0.9, 0.5, 0.2, 0.07, 0.02  # of the largest torque: where a limit is sought
 CORNER = 1e-8  # of the limit, within which even a clip is round
 
 
@@ -40,6 +41,10 @@ class TorqueSaturation(Effect):
     def torque_limit(self, values):
         """The limit; a round knee comes near it for large torques only."""
         return values['limit']
+
+    def starts_beside(self, torque):
+        """Limits below that torque: a higher one shows in nothing."""
+        return [{'limit': share * torque} for share in CLIPPED]
 
     def deliver(self, torque, z, p):
         """(KNEE), with the difference of the roots written as a sum."""

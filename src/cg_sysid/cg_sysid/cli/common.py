@@ -17,7 +17,9 @@ from cg_sysid import parallel
 from cg_sysid.checks.loading import Loaded
 from cg_sysid.checks.recordings import use_anyway_option
 from cg_sysid.deadline import OutOfTime
+from cg_sysid.errors import RecordingError
 from cg_sysid.records import bags
+from cg_sysid.records.record import Record
 from cg_sysid.report.wording import (
     event_words,
     left_words,
@@ -146,6 +148,33 @@ def records_held(pattern: str | None, loaded: Loaded) -> tuple[str, ...] | None:
             f'there are: {", ".join(names)}'
         )
     return held
+
+
+def usable(loaded: Loaded) -> tuple[Record, ...]:
+    """The records of what was loaded.
+
+    Raises:
+        RecordingError: if no recording is usable, with the reason of the first.
+    """
+    if not loaded.records:
+        first = loaded.left_out[0]
+        raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
+    return tuple(loaded.records)
+
+
+def command_words(options: argparse.Namespace, named: Mapping[str, object]) -> list[str]:
+    """Arguments that do the same again.
+
+    Args:
+        options: The common options.
+        named: Option -> value, of one program; None where it was not given.
+    """
+    words = ['--model', options.model, '--out', str(options.out)]
+    for name, value in {**named, '--note': options.note, '--input': options.torque}.items():
+        words += [] if value is None else [name, str(value)]
+    for finding in options.use_anyway:
+        words += ['--use-anyway', finding]
+    return [*words, *options.bags]
 
 
 def load_note(path: str | None) -> dict[str, Any] | None:

@@ -32,7 +32,7 @@ from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.experiments.catalogue import experiments_for
 from cg_sysid.progress import Bars
-from cg_sysid.provenance import provenance
+from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import curves, write_report
 from cg_sysid.report.diagnosis_file import Facts, write_facts
 from cg_sysid.report.facts import diagnosis_facts, unusable_facts
@@ -123,7 +123,7 @@ def work(options: argparse.Namespace) -> int:
         )
         origin = provenance(
             model_file,
-            ['cg', 'diagnose', *_command(options)],
+            ['cg', 'diagnose', *cli.command_words(options, _own_options(options))],
             {
                 'effects': options.effects or 'all', 'rounds': options.rounds,
                 'budget_s': options.budget if math.isfinite(options.budget) else None,
@@ -162,21 +162,14 @@ def work(options: argparse.Namespace) -> int:
     return cli.UNUSABLE if facts['verdict'] == 'unusable' else 0
 
 
-def _command(options: argparse.Namespace) -> list[str]:
-    words = ['--model', options.model, '--out', str(options.out)]
-    for name, value in (
-        ('--effects', options.effects), ('--held', options.held), ('--window', options.window),
-        ('--note', options.note), ('--input', options.torque), ('--workers', options.workers),
-        ('--scheduler', options.scheduler),
-    ):  # fmt: skip
-        words += [] if value is None else [name, str(value)]
-    for finding in options.use_anyway:
-        words += ['--use-anyway', finding]
-    if options.rounds != Options.rounds:
-        words += ['--rounds', str(options.rounds)]
-    if options.budget != BUDGET:
-        words += ['--budget', f'{options.budget:g}']
-    return [*words, *options.bags]
+def _own_options(options: argparse.Namespace) -> dict[str, object]:
+    default = options.rounds == Options.rounds
+    return {
+        '--effects': options.effects, '--held': options.held, '--window': options.window,
+        '--workers': options.workers, '--scheduler': options.scheduler,
+        '--rounds': None if default else options.rounds,
+        '--budget': None if options.budget == BUDGET else f'{options.budget:g}',
+    }  # fmt: skip
 
 
 def _too_few(loaded: Loaded) -> bool:
@@ -245,23 +238,16 @@ def write_results(
 
 def extended_model(answer: Diagnosis, facts: Facts) -> Model:
     """The model with the causes in it; its provenance says where it comes from."""
-    origin = facts['provenance']
+    used = [source for source in facts['sources'] if source['used']]
     return replace(
         answer.model,
-        provenance={
-            'made_by': 'diagnose',
-            'created': origin['created'],
-            'parent': Path(origin['model_file']).name,
-            'parent_sha256': origin['model_sha256'],
-            'verdict': str(answer.verdict),
-            'numbers_from': 'all records' if answer.from_all else 'the training records',
-            'causes': [cause.label for cause in answer.causes],
-            'records': [
-                {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']
-            ],
-            'parent_provenance': dict(answer.nominal.provenance),
-        },
-    )
+        provenance=of_model(
+            'diagnose', facts['provenance'], answer.nominal.provenance, used,
+            verdict=str(answer.verdict),
+            numbers_from='all records' if answer.from_all else 'the training records',
+            causes=[cause.label for cause in answer.causes],
+        ),
+    )  # fmt: skip
 
 
 def show(console: Console, facts: Facts, directory: Path, quiet: bool) -> None:

@@ -19,14 +19,13 @@ from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
-from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import DataSet, prepare
 from cg_sysid.identification.fit_result import Fit
 from cg_sysid.identification.identify import fit, predict, score
 from cg_sysid.identification.nelder_mead import nelder_mead
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.progress import Bars
-from cg_sysid.provenance import provenance
+from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import curves, write_report
 from cg_sysid.report.diagnosis_file import Facts, write_facts
 from cg_sysid.report.facts import identification_facts
@@ -78,16 +77,15 @@ def work(options: argparse.Namespace) -> int:
             bars,
             options.use_anyway,
         )
-        if not loaded.records:
-            first = loaded.left_out[0]
-            raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
-        data_sets = prepare(model, loaded.records)
+        data_sets = prepare(model, cli.usable(loaded))
         found = METHODS[options.method](model, data_sets, only=only, progress=bars)
         bars('writing the report', 0, 1)
         before = _score(model, data_sets)
         origin = provenance(
             model_file,
-            ['cg', 'identify', *_command(options)],
+            ['cg', 'identify', *cli.command_words(options, {
+                '--method': options.method, '--only': options.only, '--window': options.window,
+            })],
             {
                 'method': options.method, 'only': list(only) if only else 'all free',
                 'window_s': options.window, 'input': options.torque or 'automatic',
@@ -113,18 +111,6 @@ def work(options: argparse.Namespace) -> int:
     return 0
 
 
-def _command(options: argparse.Namespace) -> list[str]:
-    words = ['--model', options.model, '--out', str(options.out), '--method', options.method]
-    for name, value in (
-        ('--only', options.only), ('--window', options.window), ('--note', options.note),
-        ('--input', options.torque),
-    ):  # fmt: skip
-        words += [] if value is None else [name, str(value)]
-    for finding in options.use_anyway:
-        words += ['--use-anyway', finding]
-    return [*words, *options.bags]
-
-
 def _score(model: Model, data_sets: Sequence[DataSet]) -> Fit | None:
     """How well the model as given simulates the records; None where it runs away."""
     try:
@@ -148,20 +134,12 @@ def _curves(
 
 def identified_model(model: Model, found: Fit, facts: Facts, loaded: Loaded) -> Model:
     """The model with the identified values; its provenance says where it comes from."""
-    origin = facts['provenance']
+    used = [{'name': s.name, 'sha256': s.sha256} for s in loaded.sources if not s.reason]
     return replace(
         found.model,
-        provenance={
-            'made_by': 'identify',
-            'method': facts['method'],
-            'created': origin['created'],
-            'parent': Path(origin['model_file']).name,
-            'parent_sha256': origin['model_sha256'],
-            'records': [
-                {'name': s.name, 'sha256': s.sha256} for s in loaded.sources if not s.reason
-            ],
-            'parent_provenance': dict(model.provenance),
-        },
+        provenance=of_model(
+            'identify', facts['provenance'], model.provenance, used, method=facts['method']
+        ),
     )
 
 

@@ -11,7 +11,7 @@ the numbers that the torques say; `cg diagnose` judges them in simulation.
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,12 +25,11 @@ from cg_dynamics.model import Model
 from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
 from cg_sysid.diagnosis.diagnose import split
-from cg_sysid.errors import RecordingError
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.parallel import run_all
 from cg_sysid.progress import Bars
-from cg_sysid.provenance import provenance
+from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import friction_picture
 from cg_sysid.report.diagnosis_file import plain
 from cg_sysid.search.torque_selection import Law, TorqueSelection, select
@@ -38,7 +37,6 @@ from cg_sysid.text import effect_name, listed, measured, number
 
 FORMAT = 'cg_torques/1'
 TURNED_DOWN = 3  # that are named, the best of those with any evidence
-NAMED = 0.03  # of the squared torque error: a joint where a law takes less is not named
 
 Facts = dict[str, Any]
 
@@ -74,10 +72,7 @@ def work(options: argparse.Namespace) -> int:
             options.bags, model_file, cli.load_note(options.note), options.torque, None, bars,
             options.use_anyway, whole=True,
         )  # fmt: skip
-        if not loaded.records:
-            first = loaded.left_out[0]
-            raise RecordingError(f'no usable recording; {first.path}: {first.reason}')
-        records = loaded.records
+        records = cli.usable(loaded)
         if len(records) == 1:  # nothing has to be followed from the start of a half
             records = tuple(records[0].segments(records[0].duration / 2))
         train, held = split(prepare(model, records), cli.records_held(options.held, loaded))
@@ -92,7 +87,9 @@ def work(options: argparse.Namespace) -> int:
         friction = friction_of(found.model, held)
     origin = provenance(
         model_file,
-        ['cg', 'torques', *_command(options)],
+        ['cg', 'torques', *cli.command_words(options, {
+            '--effects': options.effects, '--held': options.held, '--workers': options.workers,
+        })],
         {
             'effects': options.effects or 'all', 'held': options.held or 'automatic',
             'input': options.torque or 'automatic', 'note': options.note,
@@ -108,18 +105,6 @@ def work(options: argparse.Namespace) -> int:
     cli.print_left_out(facts)
     show(Console(), found, options.out, options.quiet)
     return 0
-
-
-def _command(options: argparse.Namespace) -> list[str]:
-    words = ['--model', options.model, '--out', str(options.out)]
-    for name, value in (
-        ('--effects', options.effects), ('--held', options.held), ('--note', options.note),
-        ('--input', options.torque), ('--workers', options.workers),
-    ):  # fmt: skip
-        words += [] if value is None else [name, str(value)]
-    for finding in options.use_anyway:
-        words += ['--use-anyway', finding]
-    return [*words, *options.bags]
 
 
 def facts_of(
@@ -168,20 +153,11 @@ def _law_facts(law: Law, joints: Sequence[str]) -> Facts:
 
 def extended_model(found: TorqueSelection, model: Model, facts: Facts) -> Model:
     """The model with the laws in it; its provenance says where it comes from."""
-    origin = facts['provenance']
+    used = [source for source in facts['sources'] if source['used']]
+    laws = [law.label for law in found.laws]
     return replace(
         found.model,
-        provenance={
-            'made_by': 'torques',
-            'created': origin['created'],
-            'parent': Path(origin['model_file']).name,
-            'parent_sha256': origin['model_sha256'],
-            'laws': [law.label for law in found.laws],
-            'records': [
-                {'name': s['name'], 'sha256': s['sha256']} for s in facts['sources'] if s['used']
-            ],
-            'parent_provenance': dict(model.provenance),
-        },
+        provenance=of_model('torques', facts['provenance'], model.provenance, used, laws=laws),
     )
 
 
@@ -196,7 +172,7 @@ def show(console: Console, found: TorqueSelection, directory: Path, quiet: bool)
                   highlight=False)  # fmt: skip
     if not quiet:
         for law in found.laws:
-            _show_law(console, law, found.coordinates)
+            _show_law(console, law, found.shares(law))
         for law in [law for law in found.turned_down if law.nats > 0][:TURNED_DOWN]:
             console.print(
                 f'  not taken up: {effect_name(law.label)}: {law.reason}', highlight=False
@@ -209,14 +185,13 @@ def show(console: Console, found: TorqueSelection, directory: Path, quiet: bool)
     console.print(f'picture: {directory / "friction.png"}', highlight=False, soft_wrap=True)
 
 
-def _show_law(console: Console, law: Law, joints: Sequence[str]) -> None:
+def _show_law(console: Console, law: Law, shares: Mapping[str, float]) -> None:
     numbers = ', '.join(f'{name} = {measured(*told)}' for name, told in law.parameters.items())
     console.print(
         f'  [bold]{effect_name(law.label)}[/]: {numbers}  (evidence {law.nats:.0f} nats)',
         highlight=False,
     )
-    at = [f'{share:.0%} at {joint}' for joint, share in zip(joints, law.taken, strict=True)
-          if share > NAMED]  # fmt: skip
+    at = [f'{share:.0%} at {joint}' for joint, share in shares.items()]
     console.print(f'    takes of the squared error: {listed(at)}', highlight=False)
     for rival in law.rivals:
         console.print(f'    or: {effect_name(rival)}', highlight=False)

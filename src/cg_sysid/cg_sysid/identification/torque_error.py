@@ -1,6 +1,6 @@
 """Identification by torque error: what a measured motion takes, less what acted.
 
-    r_k = S^-1 (Q(x_k, u_k, p) - ID(q_k, v_k, a_k, p)),   x_k = (q_k, v_k) and a_k measured   (TE)
+    r_k = S^-1 (<Q(x, u, p)>_k - ID(q_k, v_k, a_k, p)),   x = (q, v) and a measured           (TE)
 
 Nothing is simulated, so that no start is too far off and nothing runs away: an arm of six joints
 is fitted in a second. In return it is biased: derivatives of samples are smoothed, and sensors
@@ -9,8 +9,9 @@ motion where their joint and its motor are all that moves them (along_motion.py)
 elsewhere. So it says where a fit by simulation error sets out, and which candidates are worth one
 (theory.md, "Torque error").
 
-Where friction turns within a window of the measured motion (measured_motion.py) a row is far off,
-so rows are distributed as Student's t (student_t.py).
+Each row is a window of the measured motion (measured_motion.py), in the mean of which the drives
+and the friction of the joints count (window_torque.py). Where friction turns a row may be far off
+still, so rows are distributed as Student's t (student_t.py).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,11 +32,13 @@ from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_sysid.identification import along_motion
 from cg_sysid.identification.along_motion import AlongMotion
+from cg_sysid.identification.along_rows import AlongRows
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.hope import out_of_reach
 from cg_sysid.identification.measured_motion import Motion, motion_of
 from cg_sysid.identification.student_t import deviance, row_scale, scale_of
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
+from cg_sysid.identification.window_torque import WindowTorque
 
 SHORTER = 0.5  # times that and STRIDE_S where a rotor moves by itself, which it does faster
 ENOUGH_S = 10.0  # of all records together, to be followed by a rotor
@@ -245,45 +248,15 @@ def _rms(values: np.ndarray) -> np.ndarray:
         return np.sqrt(np.nansum(values**2, axis=0) / np.isfinite(values).sum(axis=0))
 
 
-class AlongRows:
-    """A function of (x, u, a, p) along the rows of a motion, for ever other p.
-
-    It reads and writes these arrays in place: to hand matrices over would take longer than to
-    work them out.
-    """
-
-    def __init__(self, e: Equations, motion: Motion, result: ca.SX):
-        k, m = motion.position.shape
-        every = ca.Function('along_rows', [e.x, e.u, e.acceleration, e.p], [ca.cse(result)]).map(k)
-        self._p = np.empty((k, e.p.shape[0]))
-        self._result = np.empty((k, result.shape[1], m))
-        # casadi counts by columns, so that each row here is one of its columns.
-        self._given = [
-            np.ascontiguousarray(a)
-            for a in (np.hstack([motion.position, motion.rate]), motion.inputs,
-                      motion.acceleration, self._p)
-        ]  # fmt: skip
-        self._buffer, self._run = every.buffer()
-        for i, array in enumerate(self._given):
-            self._buffer.set_arg(i, array.data)  # type: ignore[call-arg]
-        if self._result.size:
-            self._buffer.set_res(0, self._result.data)  # type: ignore[call-arg]
-
-    def __call__(self, p: np.ndarray) -> np.ndarray:
-        """Of each row, shape (k, m, columns); it holds until the next call."""
-        self._p[:] = p
-        self._run()
-        return self._result.transpose(0, 2, 1)
-
-
 @dataclass(frozen=True)
 class Problem:
     """Motions of one set-up, and (TE) along them.
 
     Attributes:
         equations: Of the model without states.
-        error: (TE) of that, in one column.
+        error: (TE) of that at the mean motion of each window, in one column.
         slope: Its derivative by the unknowns that it has.
+        within: What the joints do in the mean of each window beside that.
         motion: What was measured.
         vector: Parameters: of the model without states, then those of each of `followed`.
         places: Of the unknowns among them.
@@ -295,6 +268,7 @@ class Problem:
     equations: Equations
     error: AlongRows
     slope: AlongRows
+    within: WindowTorque
     motion: Motion
     vector: np.ndarray
     places: list[int]
@@ -323,7 +297,7 @@ class Problem:
     def residual(self, vector: np.ndarray) -> np.ndarray:
         """(TE) of each row with these parameters, shape (k, m)."""
         plain = self.equations.p.shape[0]
-        found = self.error(vector[:plain])[:, :, 0]
+        found = self.error(vector[:plain])[:, :, 0] + self.within(vector[:plain])
         for effect, own in self._followed(vector):
             force, _ = effect(vector[:plain], vector[own])
             with np.errstate(invalid='ignore'):
@@ -335,7 +309,9 @@ class Problem:
         plain = self.equations.p.shape[0]
         k, m = self.motion.position.shape
         found = np.zeros((k, m, len(self.places)))
-        found[:, :, [place < plain for place in self.places]] = self.slope(vector[:plain])
+        found[:, :, [place < plain for place in self.places]] = self.slope(
+            vector[:plain]
+        ) + self.within.slope(vector[:plain])
         for effect, own in self._followed(vector):
             _, slope = effect(vector[:plain], vector[own])
             for i, place in enumerate(self.places):
@@ -385,18 +361,23 @@ def problems_of(
         own_places = [k for k in places if k < e.p.shape[0]]
         moved = ca.vertcat(*(e.p[k] for k in own_places)) if own_places else ca.SX(0, 1)
         vector, acted = _vector(model, setup), _acted(plain, e, every)
-        balance = _balance(plain, e, setup, np.sqrt(np.mean(acted**2, axis=0)))
+        units = _units(plain, e, setup, np.sqrt(np.mean(acted**2, axis=0)))
+        balance, x = e.imbalance / units, np.hstack([every.position, every.rate])
         error, slope = (
-            AlongRows(e, every, ca.densify(x)) for x in (balance, ca.jacobian(balance, moved))
+            AlongRows(e, ca.densify(wanted), x, every.inputs, every.acceleration)
+            for wanted in (balance, ca.jacobian(balance, moved))
         )
+        within = WindowTorque(e, e.torques / units, every, own_places)
         moving = plain.mechanism.kinematics(setup).names
         free = np.array([name in moving for name in plain.mechanism.coordinates])
-        found.append(Problem(e, error, slope, every, vector, places, acted, free, followed))
+        found.append(
+            Problem(e, error, slope, within, every, vector, places, acted, free, followed)
+        )
     return found
 
 
-def _balance(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.SX:
-    """(TE) in units of what was measured.
+def _units(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.SX:
+    """What (TE) counts in, (m, 1): what was measured.
 
     Of what a drive moves that is the torque that it reports: that it delivers nothing, and nothing
     weighs anything, would leave no error. Of what nothing drives it is the acceleration, times the
@@ -411,17 +392,17 @@ def _balance(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> c
     own = ca.diag(e.mass_matrix)
     believed = ca.substitute(own, e.p, parameter_vector(model, setup))
     driving = _driving(model, setup) != 0
-    rows = []
+    units = []
     for k in range(e.coordinates):
         drives = [joint for joint, on in zip(model.mechanism.joints, driving[:, k], strict=True)
                   if on]  # fmt: skip
         if not drives:
-            rows.append(e.imbalance[k] * believed[k] / own[k])
+            units.append(own[k] / believed[k])
         elif len(drives) == 1 and typical[k] > 0:
-            rows.append(e.imbalance[k] / _delivered(model, e, drives[0], float(typical[k])))
+            units.append(_delivered(model, e, drives[0], float(typical[k])))
         else:
-            rows.append(e.imbalance[k])
-    return ca.vertcat(*rows)
+            units.append(ca.SX(1))
+    return ca.vertcat(*units)
 
 
 def _delivered(model: Model, e: Equations, joint: str, typical: float) -> ca.SX:

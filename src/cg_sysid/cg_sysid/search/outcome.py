@@ -1,6 +1,6 @@
 """What came of fitting a candidate: errors, numbers, events, and what speaks against it."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +9,7 @@ from cg_dynamics.effects import LIBRARY
 from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
 from cg_sysid.identification.fit_result import Fit
+from cg_sysid.identification.unknowns import Unknown
 from cg_sysid.search import settings
 from cg_sysid.search.nuisance import Bounds
 from cg_sysid.search.task import Task
@@ -212,24 +213,38 @@ def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
 
 def at_edge(o: Outcome) -> list[str]:
     """That a parameter at the edge of its range says that the effect is not what is meant."""
+    return edges_in_words(o.label, parameters_at_edge(o))
+
+
+def edges_in_words(label: str, at_edge: Mapping[str, tuple[float, str]]) -> list[str]:
+    """The same of parameters of an effect, name -> value and unit."""
     return [
-        f'{o.label}.{name} = {measured(value, None, unit)} lies at the edge of its range'
-        for name, (value, unit) in parameters_at_edge(o).items()
+        f'{label}.{name} = {measured(value, None, unit)} lies at the edge of its range'
+        for name, (value, unit) in at_edge.items()
     ]
 
 
 def parameters_at_edge(o: Outcome) -> dict[str, tuple[float, str]]:
-    """Those of an outcome's effect, with value and unit.
+    """Those of an outcome's effect, with value and unit; small faults have no such edge."""
+    fitted = zip(o.train.unknowns, o.train.values, strict=True)
+    return edges(
+        o.label, _declared_by(o), [(u, v) for u, v in fitted if u.name not in o.task.bounds]
+    )
+
+
+def edges(
+    label: str, declared: Sequence[Parameter], fitted: Iterable[tuple[Unknown, float]]
+) -> dict[str, tuple[float, str]]:
+    """Parameters of an effect at the edge of their range, with value and unit.
 
     But for a part of an effect that may well be absent: the edge is where it vanishes; and where
     physics ends with the range.
     """
     found = {}
-    declared = _declared_by(o)
-    optional = {f'{o.label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
-    ends = {f'{o.label}.{p.name}': p.ends for p in declared}
-    for u, v in zip(o.train.unknowns, o.train.values, strict=True):
-        if u.name in o.task.bounds or not u.name.startswith(f'{o.label}.'):
+    optional = {f'{label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
+    ends = {f'{label}.{p.name}': p.ends for p in declared}
+    for u, v in fitted:
+        if not u.name.startswith(f'{label}.'):
             continue
         low, high, at = (
             u.to_coordinate(x) if not u.logarithmic or x > 0 else -np.inf
@@ -243,5 +258,5 @@ def parameters_at_edge(o: Outcome) -> dict[str, tuple[float, str]]:
         below = low + margin if u.name not in optional and 'lower' not in physical else -np.inf
         above = high - margin if 'upper' not in physical else np.inf
         if not below < at < above:
-            found[u.name.removeprefix(f'{o.label}.')] = float(v), u.unit
+            found[u.name.removeprefix(f'{label}.')] = float(v), u.unit
     return found

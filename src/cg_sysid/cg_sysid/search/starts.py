@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cg_dynamics.effects.effect import Effect
+from cg_dynamics.mechanisms.mechanism import Mechanism
 from cg_dynamics.model import Model
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.fit_result import Fit
@@ -29,6 +30,21 @@ def starts_of(effect: Effect) -> list[dict[str, float]]:
     ]
 
 
+def starts_beside(
+    effect: Effect, body: Mechanism, train: Sequence[DataSet]
+) -> list[dict[str, float]]:
+    """The same, from the torques in `train` where the effect's law is one of the torque."""
+    drive = dict(zip(body.joints, body.inputs, strict=True)).get(effect.site)
+    torques = [float(np.abs(t.inputs_for([drive])).max()) for t in train if drive is not None]
+    bounds = {p.name: (p.lower, p.upper) for p in effect.parameters}
+    found = [
+        start
+        for start in (effect.starts_beside(max(torques)) if any(torques) else [])
+        if all(bounds[name][0] <= value <= bounds[name][1] for name, value in start.items())
+    ]
+    return found or starts_of(effect)
+
+
 def starting_models(task: Task, train: Sequence[DataSet] = ()) -> Iterator[Model]:
     """The base with the effect, at each of its starts; some follow from the torques in `train`."""
     tried = effect_of(task)
@@ -38,11 +54,7 @@ def starting_models(task: Task, train: Sequence[DataSet] = ()) -> Iterator[Model
     name, at = task.effect
     small = any(effect.label == tried.label for effect in task.model.effects)
     base = task.model.without_effect(tried.label) if small else task.model
-    body = task.model.mechanism
-    drive = dict(zip(body.joints, body.inputs, strict=True)).get(tried.site)
-    torques = [float(np.abs(t.inputs_for([drive])).max()) for t in train if drive is not None]
-    starts = tried.starts_beside(max(torques)) if any(torques) else []
-    for start in starts or starts_of(tried):
+    for start in starts_beside(tried, task.model.mechanism, train):
         yield base.with_effect(name, at, **start | turning(base, name, at))
 
 

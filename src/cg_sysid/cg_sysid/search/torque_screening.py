@@ -34,14 +34,16 @@ from cg_dynamics.effects.effect import CLOCKS
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
+from cg_sysid.identification.along_motion import Samples
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.measured_motion import STRIDE_S, Motion, noise_gains
 from cg_sysid.identification.student_t import row_scale, spread_of
 from cg_sysid.identification.torque_error import Problem, TorqueFit
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
+from cg_sysid.identification.window_torque import WindowTorque
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search.nuisance import Bounds
-from cg_sysid.search.starts import starts_of
+from cg_sysid.search.starts import starts_beside, starts_of
 from cg_sysid.search.task import EffectAt
 
 SEEN = 10.0  # nats that a candidate has to gain
@@ -149,23 +151,24 @@ def scores(
     base = _Base.of(model, train, bounds, numbers)
     if base is None:
         return None
-    tests = {c: said for c in candidates if (said := base.score_tests(*c)) is not None}
+    starts = {c: _starts(model, c, train) for c in candidates}
+    tests = {c: s for c in candidates if (s := base.score_tests(*c, starts[c])) is not None}
     gains = {c: max(0.0, *of_starts) for c, of_starts in tests.items()}
     joints = model.mechanism.coordinates
     noise = _noise(train[0], base.problems, base.by_motion)
     order = np.argsort(-base.fitted.rms / np.maximum(noise, 1e-12))
     worst = _worst([joints[k] for k in order], missed or {})
     follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:most]
-    promising = {c: [int(k) for k in np.argsort(tests[c])[::-1][:STARTS]] for c in follow}
+    promising = {c: [starts[c][k] for k in np.argsort(tests[c])[::-1][:STARTS]] for c in follow}
     for name, at in candidates:
         effect = LIBRARY[name](model.mechanism, at)
         if (name, at) in gains or effect.states or _sensed(name):
             continue
         if _on_worst(name, at, worst):
-            promising[name, at] = list(range(len(starts_of(effect))))[:STARTS]
+            promising[name, at] = starts[name, at][:STARTS]
     fits = carry_out(
         _best_fit,
-        [(base.plain, c, starts, train, bounds, base.fitted) for c, starts in promising.items()],
+        [(base.plain, c, own, train, bounds, base.fitted) for c, own in promising.items()],
         'what torques say',
     )
     extended = {c: found for c, found in zip(promising, fits, strict=True) if found is not None}
@@ -242,9 +245,11 @@ class _Base:
         return cls(plain, values, unknowns, theta, fitted, problems, by_motion, scale, taken,
                    left - taken @ (taken.T @ left))  # fmt: skip
 
-    def score_tests(self, name: str, at: str | None) -> list[float] | None:
+    def score_tests(
+        self, name: str, at: str | None, starts: Sequence[dict[str, float]]
+    ) -> list[float] | None:
         """Nats that a candidate could gain from each of its starts; None of one without a D."""
-        columns = _columns(self.model, name, at, self.problems, self.by_motion)
+        columns = _columns(self.model, name, at, starts, self.problems, self.by_motion)
         return None if columns is None else [self._score(start) for start in columns]
 
     def _score(self, columns: np.ndarray) -> float:
@@ -390,10 +395,17 @@ def _late(name: str) -> bool:
     return LIBRARY[name].place == 'timing'
 
 
+def _starts(model: Model, candidate: EffectAt, train: Sequence[DataSet]) -> list[dict[str, float]]:
+    """Where a candidate sets out: from as many values as it declares."""
+    effect = LIBRARY[candidate[0]](model.mechanism, candidate[1])
+    found = starts_beside(effect, model.mechanism, train)
+    return found[:: -(-len(found) // len(starts_of(effect)))]
+
+
 def _best_fit(
     model: Model,
     candidate: EffectAt,
-    promising: Sequence[int],
+    promising: Sequence[dict[str, float]],
     train: Sequence[DataSet],
     bounds: Bounds,
     base: TorqueFit,
@@ -403,7 +415,7 @@ def _best_fit(
     Args:
         model: The base, without states.
         candidate: (effect, place).
-        promising: Which of its starts are tried.
+        promising: Those of its starts that are tried.
         train: Prepared records.
         bounds: Of small faults.
         base: Its fit.
@@ -413,8 +425,7 @@ def _best_fit(
     small = any(effect.label == label for effect in model.effects)
     without = model.without_effect(label) if small else model
     own = {n: b for n, b in bounds.items() if not n.startswith(f'{label}.')}
-    starts = starts_of(LIBRARY[name](model.mechanism, at))
-    extended = [without.with_effect(name, at, **starts[k]) for k in promising]
+    extended = [without.with_effect(name, at, **start) for start in promising]
     found = torque_error.fits_by_torque(extended, train, None, own, at=base.values)
     pairs = zip(extended, found, strict=True) if found else []
     return min(pairs, key=lambda pair: pair[1].deviance, default=None)
@@ -438,9 +449,25 @@ def _as_predicted(
         error = residual[first:last, problem.free] @ np.linalg.pinv(rows @ basis)
         inputs[:, : len(rows)] -= error
         acted = problem.acted - error @ rows @ basis
-        found.append(replace(problem, motion=replace(motion, inputs=inputs), acted=acted))
+        begins = np.flatnonzero(motion.first)[1:]
+        records = tuple(
+            _less(samples, own)
+            for samples, own in zip(motion.records, np.split(error, begins), strict=True)
+        )
+        motion = replace(motion, inputs=inputs, records=records)
+        found.append(replace(problem, motion=motion, acted=acted))
         first = last
     return found
+
+
+def _less(samples: Samples, error: np.ndarray) -> Samples:
+    """Samples of a record less the torque error of its windows, (windows, drives)."""
+    middle = len(samples.weights) // 2 + samples.stride * np.arange(len(error))
+    at = np.arange(len(samples.inputs))
+    inputs = samples.inputs.copy()
+    for k, own in enumerate(error.T):
+        inputs[:, k] -= np.interp(at, middle, own)
+    return replace(samples, inputs=inputs)
 
 
 class _Weightless(Urdf):
@@ -464,6 +491,7 @@ def _columns(
     model: Model,
     name: str,
     at: str | None,
+    starts: Sequence[dict[str, float]],
     problems: Sequence[Problem],
     by_motion: Sequence[np.ndarray],
 ) -> list[np.ndarray] | None:
@@ -483,7 +511,7 @@ def _columns(
     for other in model.effects:
         if other.label != effect.label and other.site == effect.site and not other.states:
             bare = bare.with_effect(other.name, other.at, **model.values_of(other))
-    from_starts = [bare.with_effect(name, at, **start) for start in starts_of(effect)]
+    from_starts = [bare.with_effect(name, at, **start) for start in starts]
     found = [
         [problem.of_all(d, 0.0) for d in _from_starts(from_starts, effect.label, problem, motion)]
         for problem, motion in zip(problems, by_motion, strict=True)
@@ -502,10 +530,12 @@ def _from_starts(
         if n.startswith(f'{label}.') and model.declarations[n].free
     ]  # fmt: skip
     f = _by_parameters(e, own, [int(k) for k in np.flatnonzero(problem.free)])
-    return [
-        _one_column(f, parameter_vector(start, motion.setup), problem, by_motion)
-        for start in models
-    ]
+    within = WindowTorque(e, e.torques, motion, own)
+    found = []
+    for start in models:
+        p = parameter_vector(start, motion.setup)
+        found.append(_one_column(f, p, problem, by_motion) + within.slope(p))
+    return found
 
 
 def _by_parameters(e: Equations, own: Sequence[int], sensors: Sequence[int]) -> ca.Function:

@@ -34,15 +34,14 @@ from cg_sysid.identification.unknowns import IdentificationError, unknowns_of
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search import settings
 from cg_sysid.search.model_selection import block_s
+from cg_sysid.search.outcome import edges, edges_in_words
 from cg_sysid.search.task import EffectAt, candidates_for
 from cg_sysid.search.torque_screening import scores
 from cg_sysid.text import measured
 
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
 MOST = 16  # effects that are taken up
-MATERIAL = (
-    0.03  # of the squared torque error of one joint, held out, that an effect takes at least
-)
+MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
 Sizes = Mapping[str, tuple[float, float, str]]
@@ -94,6 +93,11 @@ class TorqueSelection:
     turned_down: tuple[Law, ...]
     model: Model
 
+    def shares(self, law: Law) -> dict[str, float]:
+        """Coordinate -> share of its squared torque error that a law takes, if MATERIAL."""
+        taken = zip(self.coordinates, law.taken, strict=True)
+        return {name: float(share) for name, share in taken if share > MATERIAL}
+
 
 def select(
     model: Model,
@@ -134,9 +138,11 @@ def select(
         worth = [(law, there) for law, there in judged if not law.reason]
         if not worth or len(laws) == MOST:
             break
-        (best, base), *others = worth
-        least = best.nats - settings.SELECTION.margin
-        rivals = tuple(other.label for other, _ in others if other.nats > least)
+        least = worth[0][0].nats - settings.SELECTION.margin
+        near = [(law, there) for law, there in worth if law.nats > least]
+        # A drift that takes minutes is a constant: of what evidence cannot tell, the simplest.
+        best, base = min(near, key=lambda pair: len(pair[0].parameters))
+        rivals = tuple(law.label for law, _ in near if law is not best)
         laws.append(replace(best, rivals=rivals))
     base, laws = search.doubted(base, laws)
     # Who judged has no more say: the numbers are those of all records.
@@ -249,16 +255,34 @@ class _Search:
             base.model, self.train, self.candidates(base.model), {}, self.carry_out,
             numbers=base.said.values, most=FITTED,
         )  # fmt: skip
-        judged = []
-        for model, said in found.extended.values() if found else ():
-            there = self._with_errors(model, said)
-            judged.append((self._law(base, there, model.effects[-1].label), there))
+        fits = [self._with_errors(*pair) for pair in found.extended.values()] if found else []
+        if not fits:
+            return []
+        # Each would have its own, and of two that leave the same one would be worth more.
+        independent = min(fits, key=lambda there: there.said.deviance).independent()
+        judged = [
+            (self._law(base, there, there.model.effects[-1].label, independent), there)
+            for there in fits
+        ]
         return sorted(judged, key=lambda pair: -pair[0].nats)
 
-    def _law(self, without: _Fitted, with_it: _Fitted, label: str) -> Law:
-        """What an effect gains, and whether that is worth it (diagnosis.md, section 4)."""
+    def _law(
+        self,
+        without: _Fitted,
+        with_it: _Fitted,
+        label: str,
+        independent: tuple[np.ndarray, np.ndarray],
+    ) -> Law:
+        """What an effect gains, and whether that is worth it (diagnosis.md, section 4).
+
+        Args:
+            without: Fitted without it.
+            with_it: Fitted with it.
+            label: Its label.
+            independent: Number and share of independent torques, of who leads (independent()).
+        """
         sizes = self.sizes(with_it, label)
-        number, share = with_it.independent()
+        number, share = independent
         gained = share @ (without.deviance - with_it.deviance) / 2
         relieved = (without.disbelief - with_it.disbelief) / 2
         gained += relieved
@@ -271,10 +295,14 @@ class _Search:
         significance = block_gain(before, after, round(block_s(self.held) / STRIDE_S))
         left, was = (scale_of(np.vstack(fitted.held)) for fitted in (with_it, without))
         taken = 1 - (left / was) ** 2
-        return Law(
-            label, float(nats), significance, taken, sizes,
-            reason='; '.join(_shortcomings(float(nats), significance, taken, sizes, relieved)),
-        )  # fmt: skip
+        reasons = _shortcomings(float(nats), significance, taken, sizes, relieved)
+        reasons += edges_in_words(label, self._at_edge(with_it, label))
+        return Law(label, float(nats), significance, taken, sizes, reason='; '.join(reasons))
+
+    def _at_edge(self, fitted: _Fitted, label: str) -> dict[str, tuple[float, str]]:
+        known = fitted.said.values
+        numbers = [(u, known[u.name]) for u in unknowns_of(fitted.model) if u.name in known]
+        return edges(label, fitted.model.effect(label).parameters, numbers)
 
     def sizes(self, fitted: _Fitted, label: str) -> Sizes:
         """An effect's numbers, with standard deviations by the curvature of (T) and by belief."""
@@ -310,7 +338,8 @@ class _Search:
                 'each law beside the others',
             )
             lean = [self._with_errors(m, fit) for m, fit in zip(models, said, strict=True)]
-            judged = [self._law(fit, base, law.label)
+            independent = base.independent()
+            judged = [self._law(fit, base, law.label, independent)
                       for fit, law in zip(lean, laws, strict=True)]  # fmt: skip
             idle = [k for k, law in enumerate(judged) if law.reason]
             if not idle:
