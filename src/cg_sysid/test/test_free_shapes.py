@@ -252,9 +252,11 @@ def test_a_robots_friction_is_drawn_as_the_machine_draws_it_whether_it_carries_a
 
 
 @DRAWINGS
-def test_friction_is_drawn_as_stated_where_much_else_is_missing(share, tails):
-    # The load leaves 450 times the noise, whatever the friction.
-    assert free_shapes.drawn_otherwise(_drawn_by(share, tails, mass=0.35)[1]) is None
+def test_where_much_else_is_missing_friction_is_drawn_as_stated_or_as_it_is(share, tails):
+    # The load leaves 450 times the noise, whatever the friction: a wrong law never fits better.
+    drawn, work = _drawn_by(share, tails, mass=0.35)
+    found = free_shapes.drawn_otherwise(work)
+    assert found is None or {name: found.values[name] for name in drawn} == drawn
 
 
 def test_a_mechanism_of_a_few_joints_is_not_asked_how_it_draws_friction(search):
