@@ -9,7 +9,7 @@ import math
 import re
 import xml.etree.ElementTree as Xml
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cg_description.reading import DocumentError, shown
 
@@ -79,6 +79,23 @@ class Joint:
         """Whether it moves along its axis."""
         return self.kind == 'prismatic'
 
+    def held(self, position: float) -> 'Joint':
+        """The fixed joint that this one is where something holds it, rad or m."""
+        turn = rotation(self.rpy)
+        xyz, rpy = self.xyz, self.rpy
+        if self.slides:
+            x, y, z = (
+                start + position * sum(row[k] * self.axis[k] for k in range(3))
+                for start, row in zip(self.xyz, turn, strict=True)
+            )
+            xyz = x, y, z
+        else:
+            own = _about(self.axis, position)
+            rpy = _angles(
+                [[sum(row[k] * own[k][j] for k in range(3)) for j in range(3)] for row in turn]
+            )
+        return Joint(self.name, 'fixed', self.parent, self.child, xyz, rpy)
+
 
 @dataclass(frozen=True)
 class RobotDescription:
@@ -110,6 +127,28 @@ class RobotDescription:
     def independent(self) -> tuple[Joint, ...]:
         """The joints that move and follow no other."""
         return tuple(joint for joint in self.moving if joint.mimic is None)
+
+    def holding(self, positions: Mapping[str, float]) -> 'RobotDescription':
+        """This robot with some joints fixed, and with them those that follow them.
+
+        Args:
+            positions: Joint that moves by itself -> where it is held, rad or m.
+
+        Raises:
+            RobotDescriptionError: One of them does not move by itself.
+        """
+        free = [joint.name for joint in self.independent]
+        for name in positions:
+            if name not in free:
+                raise RobotDescriptionError(
+                    f'{shown(name)} is no joint that moves by itself; there are: {", ".join(free)}'
+                )
+        joints = []
+        for joint in self.joints:
+            leader, ratio, offset = joint.mimic or (joint.name, 1.0, 0.0)
+            moves = joint.kind != 'fixed' and leader in positions
+            joints.append(joint.held(ratio * positions[leader] + offset) if moves else joint)
+        return replace(self, joints=tuple(joints))
 
     def text(self) -> str:
         """The least URDF that says this; `parse` reads it back to an equal description."""
@@ -260,6 +299,28 @@ def rotation(rpy: Vector) -> list[list[float]]:
     return [[round(x) * 1.0 if abs(x - round(x)) < 1e-9 else x for x in row] for row in rows]
 
 
+def _about(axis: Vector, angle: float) -> list[list[float]]:
+    """Rotation matrix about a unit vector, rows first."""
+    x, y, z = axis
+    c, s = math.cos(angle), math.sin(angle)
+    return [
+        [c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s],
+        [y * x * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
+        [z * x * (1 - c) - y * s, z * y * (1 - c) + x * s, c + z * z * (1 - c)],
+    ]
+
+
+def _angles(turn: Sequence[Sequence[float]]) -> Vector:
+    """Roll, pitch and yaw of a rotation matrix; where only their sum is known all is yaw."""
+    cosine = math.hypot(turn[0][0], turn[1][0])
+    pitch = math.atan2(-turn[2][0], cosine)
+    if cosine < 1e-9:
+        return 0.0, pitch, math.atan2(-turn[0][1], turn[1][1])
+    return (
+        math.atan2(turn[2][1], turn[2][2]), pitch, math.atan2(turn[1][0], turn[0][0])
+    )  # fmt: skip
+
+
 def _by_name(robot: Xml.Element, tag: str, where: str) -> dict[str, Xml.Element]:
     found: dict[str, Xml.Element] = {}
     for element in robot.findall(tag):
@@ -289,7 +350,9 @@ def _joint(element: Xml.Element, where: str) -> Joint:
     length = math.hypot(*axis)
     if kind != 'fixed' and length == 0:
         raise RobotDescriptionError(f'{where}: its axis has no length')
-    unit = (axis[0] / length, axis[1] / length, axis[2] / length) if length else (1.0, 0.0, 0.0)
+    if not math.isclose(length, 1.0, rel_tol=1e-12):  # else it reads back to the digit
+        x, y, z = axis
+        axis = (x / length, y / length, z / length) if length else (1.0, 0.0, 0.0)
     bounded = kind in ('revolute', 'prismatic')
     return Joint(
         name=str(element.get('name')),
@@ -298,7 +361,7 @@ def _joint(element: Xml.Element, where: str) -> Joint:
         child=ends[1],
         xyz=_vector(element, 'origin', 'xyz', (0.0, 0.0, 0.0), where),
         rpy=_vector(element, 'origin', 'rpy', (0.0, 0.0, 0.0), where),
-        axis=unit,
+        axis=axis,
         lower=_number(element, 'limit', 'lower', -math.inf, where) if bounded else -math.inf,
         upper=_number(element, 'limit', 'upper', math.inf, where) if bounded else math.inf,
         effort=_number(element, 'limit', 'effort', math.inf, where),

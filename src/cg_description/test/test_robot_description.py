@@ -59,6 +59,13 @@ def test_what_is_written_reads_back_equal():
     assert parse(robot.text()) == robot
 
 
+def test_an_axis_that_is_not_of_unit_length_reads_back_equal():
+    for seed in range(20):
+        axis = ' '.join(repr(math.sin(9.0 * seed + k)) for k in range(3))
+        robot = parse(ARM.replace('<axis xyz="0 1 0"/>', f'<axis xyz="{axis}"/>'))
+        assert parse(robot.text()) == robot
+
+
 def test_new_inertias_leave_all_else_as_it_is():
     new = Inertial(3.0, (0.01, 0.02, 0.03), (0.1, 0.2, 0.25, 0.01, 0.02, 0.03))
     text = with_inertials(ARM, {'upper': new, 'tip': new})

@@ -79,15 +79,28 @@ class Parameter:
         At the same accelerations and frequencies, torques, stiffness and inertias follow it. The
         range becomes wider only.
         """
-        if not self.unit.startswith(('N', 'kg')):
+        if not self.follows_size:
+            return self
+        return replace(
+            self.reaching(inertia),
+            starts=tuple(inertia * x for x in self.starts),
+            scale=inertia * self.scale,
+        )
+
+    def reaching(self, inertia: float) -> 'Parameter':
+        """This declaration with a range for drives that have to turn so many kg m^2 (kg) too."""
+        if not self.follows_size:
             return self
         return replace(
             self,
             lower=min(self.lower, inertia * self.lower),
             upper=max(self.upper, inertia * self.upper),
-            starts=tuple(inertia * x for x in self.starts),
-            scale=inertia * self.scale,
         )
+
+    @property
+    def follows_size(self) -> bool:
+        """Whether it is a torque, a stiffness, a damping or an inertia."""
+        return self.unit.startswith(('N', 'kg'))
 
     @property
     def default(self) -> float:

@@ -1,18 +1,20 @@
 """A robot by its URDF: its numbers, its coordinates, and what is compiled of it."""
 
+import pickle
+
 import casadi as ca
 import numpy as np
 import pytest
 from random_trees import random_tree
 
 from cg_description.model_file import ModelFile
-from cg_description.robot_description import parse, with_inertials
+from cg_description.robot_description import RobotDescriptionError, parse, with_inertials
 from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.effects import LIBRARY, make_effect
 from cg_dynamics.effects.effect import START_TORQUE
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms import mechanism
-from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.mechanisms.urdf import Urdf, nearest_real
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_dynamics.rollout.compiled import CompiledModel, compile_model, simulate
@@ -108,6 +110,31 @@ def test_welded_links_weigh_with_the_link_that_carries_them():
 def test_an_inertia_that_no_body_has_is_refused():
     with pytest.raises(ModelError, match=r"link 'rod': no body has the inertia.*0.002, 0.03, 0.9"):
         robot(PENDULUM.replace('iyy="0.031"', 'iyy="0.9"').replace('ixz="0.001"', 'ixz="0"'))
+
+
+def test_the_nearest_inertia_that_a_body_has_keeps_the_largest_moment():
+    """Second moments 0.4495, 0.4505 and, less than nothing, -0.4485 kg m^2 about turned axes."""
+    turned = PENDULUM.replace(
+        '<origin xyz="0.02 0 -0.3"/>', '<origin xyz="0.02 0 -0.3" rpy="1 2 3"/>'
+    )
+    unreal = turned.replace('iyy="0.031"', 'iyy="0.9"').replace('ixz="0.001"', 'ixz="0"')
+    description, changed = nearest_real(parse(unreal))
+    before, after = changed['rod']
+    thin = 1.2 * 1e-6  # kg m^2, of a body that is a millimetre thin
+    np.testing.assert_allclose(before, [0.002, 0.03, 0.9], rtol=1e-12)
+    own = (0.9 + 0.002 - 0.03) / 2, (0.9 + 0.03 - 0.002) / 2
+    np.testing.assert_allclose(after, [own[0] + thin, own[1] + thin, 0.9], rtol=1e-9)
+    rod = Urdf(description).inertials(nominal(Urdf(description)))['rod']
+    np.testing.assert_allclose(rod.inertia, description.inertials['rod'].inertia, rtol=1e-9)
+    assert nearest_real(parse(turned)) == (parse(turned), {})
+
+
+def test_what_weighs_on_no_joint_may_be_anything():
+    weight = '<mass value="1"/><inertia ixx="1" iyy="1" izz="9" ixy="0" ixz="0" iyz="0"/>'
+    base = f'<link name="base"><inertial>{weight}</inertial></link>'
+    welded = PENDULUM.replace('<link name="base"/>', base)
+    assert nearest_real(parse(welded))[1] == {}
+    assert Urdf(parse(welded)).coordinates == ('pivot',)
 
 
 def test_a_point_mass_gets_a_little_extent():
@@ -233,12 +260,27 @@ def test_what_a_drive_has_to_turn_sets_where_effects_set_out():
     assert min(own) < arm.inertia_at(arm.coordinates[0]) < max(own)
 
 
+def test_a_heavy_joint_may_rub_and_push_more():
+    """A lift of 122 kg with 20 kN s/m of damping, as PR2 states of its torso."""
+    limit = '<limit effort="10000" velocity="0.01" lower="0" upper="0.3"/>'
+    lift = PENDULUM.replace('continuous', 'prismatic').replace('value="1.2"', 'value="122"')
+    model = robot(lift.replace('<axis', f'{limit}<axis'))
+    model = model.with_effect('viscous_friction', coefficient=20000.0)
+    assert model.declarations['viscous_friction.coefficient'].upper == pytest.approx(122_000)
+    legs = LIBRARY['viscous_friction'].parameters[0]
+    light = LIBRARY['viscous_friction'](robot(PENDULUM).mechanism).parameters[0]
+    assert light == legs  # ranges become wider only
+
+
 def test_equal_robots_are_one():
     a, b, other = (Urdf(parse(random_tree(seed, 2))) for seed in (3, 3, 4))
     assert a == b
     assert hash(a) == hash(b)
     assert a != other
     assert a.identity != Urdf(parse(random_tree(3, 2)), rates=True).identity
+    there, again = (pickle.loads(pickle.dumps(a)) for _ in range(2))
+    assert there == a
+    assert again is there  # what follows from a URDF is worked out once a process
 
 
 def test_a_model_reads_back_from_its_own_text():
@@ -281,6 +323,38 @@ def test_locked_joints_stand_where_they_are_held():
     assert held.to_dict()['locked'] == {second: 0.7, fourth: -0.4}
     with pytest.raises(ModelError, match=r"setup\.locked: 'knee' is no joint"):
         assemble(model, Setup(locked=(('knee', 0.0),)))
+
+
+@pytest.mark.parametrize('seed', [2, 3, 9, 11])
+def test_a_robot_with_joints_held_moves_as_the_whole_one_that_keeps_them_still(seed):
+    """Five joints and one that follows the first: three of them, one that slides, are held."""
+    text = random_tree(seed, 6, mimic=True, slide=0.4)
+    whole = Urdf(parse(text))
+    random = np.random.default_rng(seed)
+    held = {name: float(random.uniform(-2, 2)) for name in whole.coordinates[::2]}
+    part = Urdf(parse(text).holding(held))
+    assert part.coordinates == whole.coordinates[1::2]
+    numbers = [{p.name: ca.SX(p.default) for p in body.parameters} for body in (whole, part)]
+    q, v, a = random.normal(size=(3, len(part.coordinates)))
+    places = [whole.coordinates.index(name) for name in part.coordinates]
+    at = np.array([held.get(name, 0.0) for name in whole.coordinates])
+    at[places] = q
+    rates, accelerations = np.zeros((2, len(at)))
+    rates[places], accelerations[places] = v, a
+    up = whole.up(Setup())
+    expected, found = (
+        np.asarray(ca.DM(body.inverse_dynamics(*map(ca.SX, motion), p, up))).ravel()
+        for body, motion, p in (
+            (whole, (at, rates, accelerations), numbers[0]), (part, (q, v, a), numbers[1]),
+        )
+    )  # fmt: skip
+    # Angles go into a matrix and back, with sixteen digits.
+    np.testing.assert_allclose(found, expected[places], rtol=0, atol=1e-12 * abs(expected).max())
+
+
+def test_who_holds_a_joint_names_one_that_moves_by_itself():
+    with pytest.raises(RobotDescriptionError, match=r"'joint_5' is no joint that moves by itself"):
+        parse(random_tree(2, 6, mimic=True)).holding({'joint_5': 0.1})
 
 
 def test_what_is_compiled_is_of_the_set_up():

@@ -171,13 +171,18 @@ class Effect:
         self.at = None if self.site == usual else self.site
         self.parameters = self.parameters_in(mechanism)  # type: ignore[misc]
         self.start_torque = START_TORQUE
-        if self.states and self.site in mechanism.all_joints:
-            # Torques tell nothing of where such an effect may set out: the joint's size does.
+        # What a drive does to its command follows the torques that it is told.
+        if self.site in mechanism.all_joints and (self.states or self.place != 'command'):
             size = mechanism.inertia_at(self.site)
-            self.parameters = tuple(p.of_size(size) for p in self.parameters)  # type: ignore[misc]
-            # Of bodies of one shape and density inertia grows as l^5, torque of gravity as l^4;
-            # mass and weight both as l^3.
-            self.start_torque *= size if self.slides(mechanism) else size**0.8
+            # Torques tell where an effect without states may set out, and nothing of one with
+            # states: there the joint's size does. Heavy joints rub and push more.
+            self.parameters = tuple(  # type: ignore[misc]
+                p.of_size(size) if self.states else p.reaching(size) for p in self.parameters
+            )
+            if self.states:
+                # Of bodies of one shape and density inertia grows as l^5, torque of gravity as
+                # l^4; mass and weight both as l^3.
+                self.start_torque *= size if self.slides(mechanism) else size**0.8
         if self.slides(mechanism):
             self.parameters = tuple(p.sliding() for p in self.parameters)  # type: ignore[misc]
 

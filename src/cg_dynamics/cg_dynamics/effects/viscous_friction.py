@@ -14,7 +14,7 @@ class ViscousFriction(Effect):
     summary = 'Friction proportional to the joint rate: -coefficient rate (Eq. 4.12).'
     parameters = (
         Parameter(
-            'coefficient', 'N m s/rad', 'friction torque per rate', 0.0, 50.0,
+            'coefficient', 'N m s/rad', 'friction torque per rate', 0.0, 1000.0,
             neutral=0.0, starts=(0.01, 0.3), scale=0.01,
         ),
     )  # fmt: skip

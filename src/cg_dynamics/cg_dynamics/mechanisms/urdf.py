@@ -25,12 +25,18 @@ import hashlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
-from cg_description.robot_description import Inertial, Joint, RobotDescription, rotation
+from cg_description.robot_description import (
+    Inertial,
+    Joint,
+    RobotDescription,
+    parse,
+    rotation,
+)
 from cg_dynamics.errors import ModelError
 from cg_dynamics.mechanisms.mechanism import Kinematics, Mechanism, PointMass, Symbols
 from cg_dynamics.parameter import Parameter
@@ -133,7 +139,7 @@ class Urdf(Mechanism):
     @cached_property
     def identity(self) -> str:
         """Name of this very robot: two that differ in a number or a joint have other ones."""
-        said = f'{self.description.text()}|{self.driven}|{self.rates}'
+        said = f'{self._text}|{self.driven}|{self.rates}'
         return f'urdf:{hashlib.sha256(said.encode()).hexdigest()[:16]}'
 
     def __eq__(self, other):
@@ -142,14 +148,19 @@ class Urdf(Mechanism):
     def __hash__(self):
         return hash(self.identity)
 
+    # Models travel between processes all the time, and what follows from a URDF takes a while.
     def __reduce__(self):
-        return Urdf, (self.description, self.driven, self.rates)
+        return _known, (self._text, self.driven, self.rates)
+
+    @cached_property
+    def _text(self) -> str:
+        return self.description.text()
 
     def robot(self):
         """Its URDF, and what that does not say."""
         every = self.driven == self.coordinates
         return {
-            'urdf': self.description.text(),
+            'urdf': self._text,
             'driven': None if every else list(self.driven),
             'rates': self.rates,
         }
@@ -320,21 +331,38 @@ class Urdf(Mechanism):
             body = joint.parent
         return tuple(dict.fromkeys(reversed(found)))
 
-    def inertials(self, values) -> dict[str, Inertial | None]:
+    def inertials(
+        self, values, given: RobotDescription | None = None
+    ) -> dict[str, Inertial | None]:
         """What each body weighs by these parameters: name of its link -> inertia of all that is
         fixed to that link, in its frame; None of links that are fixed to it.
+
+        Args:
+            values: Name -> value.
+            given: Where joints move that are held here: what hangs on those keeps its weight
+                there, which is taken off the body.
+
+        Raises:
+            ModelError: no body is left once that is taken off.
         """  # noqa: D205
+        given = given or self.description
         found: dict[str, Inertial | None] = {
             joint.child: body.inertial(values)
             for joint, body in zip(self.moving, self._bodies, strict=True)
             if body.mass > 0
         }
-        carried = {joint.child for joint in self.moving}
-        for joint in self.description.joints:
-            if joint.kind == 'fixed' and joint.parent in carried:
-                carried.add(joint.child)
-                if joint.child in self.description.inertials:
-                    found[joint.child] = None
+        there = _homes(given)
+        off: dict[str, np.ndarray] = {}
+        for link, (body, turn, origin) in _homes(self.description).items():
+            part = given.inertials.get(link)
+            if part is None or link == body:
+                continue
+            if there[link][0] == body:
+                found[link] = None
+            else:
+                off[body] = off.get(body, np.zeros((4, 4))) + _moments(part, link, turn, origin)
+        for body, parts in off.items():
+            found[body] = _without(found[body], parts, body)
         return found
 
     @cached_property
@@ -428,6 +456,12 @@ class Urdf(Mechanism):
         return np.vstack(rows)
 
 
+@lru_cache(maxsize=16)
+def _known(text: str, driven: tuple[str, ...], rates: bool) -> Urdf:
+    """The robot of a URDF, once a process."""
+    return Urdf(parse(text), driven, rates)
+
+
 class _Body:
     """The mass distribution of what moves with one joint.
 
@@ -477,10 +511,7 @@ class _Body:
         mass, h = float(m[0, 0]), h.ravel()
         x, y, z = [float(part) for part in h / mass]
         arm = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        i = (about_origin + mass * arm @ arm).tolist()
-        return Inertial(
-            mass, (x, y, z), (i[0][0], i[1][1], i[2][2], i[0][1], i[0][2], i[1][2])
-        )  # fmt: skip
+        return Inertial(mass, (x, y, z), _entries(about_origin + mass * arm @ arm))
 
 
 def _nothing() -> Mass:
@@ -533,17 +564,10 @@ def _bodies(description: RobotDescription) -> tuple[_Body, ...]:
     sums = {joint.child: np.zeros((4, 4)) for joint in description.moving}
     for link, (body, turn, origin) in _homes(description).items():
         found = description.inertials.get(link)
-        if found is None:
-            continue
-        xx, yy, zz, xy, xz, yz = found.inertia
-        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        second = _second_moment(inertia, found.mass, f'URDF {description.name!r}: link {link!r}')
-        c = origin + turn @ np.array(found.centre)
-        about = turn @ second @ turn.T + found.mass * np.outer(c, c)
-        sums[body][:3, :3] += about
-        sums[body][:3, 3] += found.mass * c
-        sums[body][3, :3] += found.mass * c
-        sums[body][3, 3] += found.mass
+        if found is not None:
+            sums[body] += _moments(
+                found, f'URDF {description.name!r}: link {link!r}', turn, origin
+            )
     made = []
     for joint in description.moving:
         total = sums[joint.child]
@@ -556,7 +580,60 @@ def _bodies(description: RobotDescription) -> tuple[_Body, ...]:
     return tuple(made)
 
 
-def _second_moment(inertia: np.ndarray, mass: float, where: str) -> np.ndarray:
+def nearest_real(
+    description: RobotDescription,
+) -> tuple[RobotDescription, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """A robot of real bodies, where a URDF gives links inertias that no body has.
+
+    The largest principal moment of such a link stays; the others grow to what a thin body has.
+
+    Returns:
+        The description, and of each link that is changed its principal moments before and after,
+        kg m^2.
+    """
+    inertials, changed = dict(description.inertials), {}
+    for link in _homes(description):
+        found = inertials.get(link)
+        if found is None:
+            continue
+        sizes, axes = _along_axes(found)
+        if not np.isfinite(sizes).all() or _real(sizes):
+            continue
+        second = _thickened(sizes, axes, found.mass)
+        tensor = np.trace(second) * np.eye(3) - second
+        inertials[link] = replace(found, inertia=_entries(tensor))
+        changed[link] = np.linalg.eigvalsh(_tensor(found)), np.linalg.eigvalsh(tensor)
+    return replace(description, inertials=inertials), changed
+
+
+def _moments(found: Inertial, where: str, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Sum over a link's mass of (x, 1)(x, 1)', in a frame in which it is so turned and placed."""
+    c = origin + turn @ np.array(found.centre)
+    sums = np.empty((4, 4))
+    sums[:3, :3] = turn @ _second_moment(found, where) @ turn.T + found.mass * np.outer(c, c)
+    sums[:3, 3] = sums[3, :3] = found.mass * c
+    sums[3, 3] = found.mass
+    return sums
+
+
+def _without(whole: Inertial | None, parts: np.ndarray, link: str) -> Inertial:
+    """What is left of a body of which parts, sums of `_moments`, are taken off."""
+    left = -parts
+    if whole is not None:
+        left = left + _moments(whole, link, np.eye(3), np.zeros(3))
+    mass = float(left[3, 3])
+    if mass > 0:
+        x, y, z = (float(at) for at in left[:3, 3] / mass)
+        second = left[:3, :3] - np.outer(left[:3, 3], left[:3, 3]) / mass
+        if _real(np.linalg.eigvalsh(second)):
+            return Inertial(mass, (x, y, z), _entries(np.trace(second) * np.eye(3) - second))
+    raise ModelError(
+        f'link {link!r}: what was identified of it is less than what hangs on joints that were '
+        f'held: {parts[3, 3]:.4g} of {mass + parts[3, 3]:.4g} kg; that cannot be written apart'
+    )
+
+
+def _second_moment(found: Inertial, where: str) -> np.ndarray:
     """Of a link about its centre, kg m^2, shape (3, 3).
 
     Points and thin rods, which have none along some axis, get THINNEST.
@@ -564,12 +641,39 @@ def _second_moment(inertia: np.ndarray, mass: float, where: str) -> np.ndarray:
     Raises:
         ModelError: if no body has this inertia.
     """
-    sizes, axes = np.linalg.eigh(np.trace(inertia) / 2 * np.eye(3) - inertia)
-    if sizes[0] < -ROUNDED * abs(sizes[-1]) or not np.isfinite(sizes).all():
-        least = np.linalg.eigvalsh(inertia)
+    sizes, axes = _along_axes(found)
+    if not np.isfinite(sizes).all() or not _real(sizes):
+        least = np.linalg.eigvalsh(_tensor(found))
         raise ModelError(
             f'{where}: no body has the inertia with principal moments {least[0]:.3g}, '
             f'{least[1]:.3g}, {least[2]:.3g} kg m^2; all must be positive, and none above the sum '
             'of the others'
         )
+    return _thickened(sizes, axes, found.mass)
+
+
+def _entries(tensor: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    """What `Inertial` has of an inertia, shape (3, 3)."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor.tolist()
+    return xx, yy, zz, xy, xz, yz
+
+
+def _tensor(found: Inertial) -> np.ndarray:
+    xx, yy, zz, xy, xz, yz = found.inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _along_axes(found: Inertial) -> tuple[np.ndarray, np.ndarray]:
+    """Second moments along the principal axes, kg m^2, the smallest first, and these axes."""
+    tensor = _tensor(found)
+    return np.linalg.eigh(np.trace(tensor) / 2 * np.eye(3) - tensor)
+
+
+def _real(sizes: np.ndarray) -> bool:
+    """Whether a body has these second moments, the smallest first, but for rounding."""
+    return bool(sizes[0] >= -ROUNDED * abs(sizes[-1]))
+
+
+def _thickened(sizes: np.ndarray, axes: np.ndarray, mass: float) -> np.ndarray:
+    """Second moment of a body that is at least THINNEST along each axis."""
     return (axes * np.maximum(sizes, mass * THINNEST**2)) @ axes.T
