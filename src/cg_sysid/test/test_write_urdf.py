@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hanging_arm import nominal, urdf
 
+from cg_description.model_file import ModelFile
 from cg_description.robot_description import parse
 from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
@@ -59,6 +60,39 @@ def test_the_urdf_moves_as_the_model_does(files, capsys):
         )
     ]
     np.testing.assert_allclose(*taken, rtol=1e-9)
+
+
+def moved_at(text, held, q):
+    """Torques of a URDF that is held so, at a motion of the rest."""
+    body = Urdf(parse(text).holding(held))
+    p = {q.name: q.default for q in body.parameters}
+    words = map(ca.SX, q)
+    return np.asarray(ca.DM(body.inverse_dynamics(*words, p, body.up(Setup()))))
+
+
+def test_what_hangs_on_a_joint_that_was_held_keeps_its_weight(tmp_path, capsys):
+    held = {'shank_joint': 0.7}
+    whole = urdf().replace('</robot>', WELDED)
+    model = Model.from_file(
+        ModelFile(name='leg', mechanism='urdf', parameters={},
+                  robot={'urdf': parse(whole).holding(held).text()})
+    ).with_values({'hip_mass': 1.2, 'thigh_mass': 1.13, 'thigh_shift_x': 0.2})  # fmt: skip
+    model.save(tmp_path / 'model.yaml')
+    (tmp_path / 'robot.urdf').write_text(whole)
+    words = [str(tmp_path / name) for name in ('model.yaml', 'robot.urdf')]
+    assert main([*words, '--out', str(tmp_path / 'new.urdf')]) == 0
+    text = (tmp_path / 'new.urdf').read_text()
+    for link in ('shank', 'sole'):
+        assert parse(text).inertials[link] == parse(whole).inertials[link]
+    motion = np.random.default_rng(3).normal(size=(3, 2))
+    body, words = model.mechanism, map(ca.SX, motion)
+    expected = ca.DM(body.inverse_dynamics(*words, model.values, body.up(Setup())))
+    np.testing.assert_allclose(moved_at(text, held, motion), np.asarray(expected), rtol=1e-9)
+    # A leg lighter than the shank that hangs on it cannot be written apart.
+    model.with_values({'thigh_mass': 0.2}).save(tmp_path / 'light.yaml')
+    words = [str(tmp_path / name) for name in ('light.yaml', 'robot.urdf')]
+    assert main([*words, '--out', str(tmp_path / 'light.urdf')]) == 2
+    assert 'less than what hangs on joints that were held: 1 of 0.54' in capsys.readouterr().err
 
 
 def test_mistakes_get_one_line(files, capsys):

@@ -1,9 +1,11 @@
 """Command line: a commented model file from a URDF, and from recordings of its joints.
 
-    cg new-robot my.urdf [--joint-states BAG ...] [--out my_robot.yaml]
+    cg new-robot my.urdf [--joint-states BAG ...] [--joints A,B] [--out my_robot.yaml]
 
 The file loads as it is. It carries what matters of the URDF; which joints have a drive, what they
-measure and how well comes from the recordings, where there are any. robots.md goes on from there.
+measure and how well comes from the recordings, where there are any. Of a hand, a mobile base or a
+second arm that somebody holds still the masses count and nothing else. robots.md goes on from
+there.
 """
 
 import argparse
@@ -25,14 +27,15 @@ from cg_description.robot_description import (
     parse,
 )
 from cg_dynamics.effects import LIBRARY
-from cg_dynamics.mechanisms.urdf import BELIEF, Urdf
+from cg_dynamics.mechanisms.urdf import BELIEF, Urdf, nearest_real
 from cg_dynamics.model import Model
 from cg_interfaces import channels
 from cg_sysid.cli import common as cli
 from cg_sysid.cli.new_model import flow, shortened
-from cg_sysid.records.bags import read_bag
+from cg_sysid.records.bags import read_bag, read_raw
 from cg_sysid.records.noise import ChannelNoise, measure_noise
 from cg_sysid.records.record import Record
+from cg_sysid.records.recorded_joints import held_positions, recorded_drives
 
 HEAD = """\
 # A model: every number of a robot, with unit and source. It was written from
@@ -60,7 +63,9 @@ OTHERS = """\
 """
 WIDTH = 99
 GUESSED = 'guessed: state the gains of the drive'
-DOUBT = 0.5  # of friction in a URDF, relative: it is a guess more often than not
+# Friction in a URDF is a guess more often than not, and often a placeholder: so far it may be off,
+# relative, and as a share of the largest torque (at the largest rate).
+DOUBT, DOUBT_OF_LARGEST = 0.5, 0.05
 # Effect -> what a URDF's `dynamics` calls its size.
 FRICTION = {'viscous_friction': 'damping', 'coulomb_friction': 'friction'}
 
@@ -70,6 +75,7 @@ def template(
     driven: Sequence[str] | None,
     records: Sequence[Record],
     source: str,
+    doubts: Sequence[str] = (),
 ) -> str:
     """The text of a model file for a robot, with comments.
 
@@ -78,6 +84,7 @@ def template(
         driven: Joints with a drive, as far as is known; None if nothing says.
         records: Recordings of it, of an interface with rates.
         source: Where the description comes from, in words.
+        doubts: What somebody should look at in the description, sentences.
     """
     rates = bool(records) and all(
         f'{j.name}_velocity' in r.outputs for r in records for j in description.independent
@@ -96,6 +103,7 @@ def template(
         '',
         '# Joints, links and inertias. `driven`: those with a drive. `rates`: whether velocities',
         '# count as measured; one that a driver made of positions does not.',
+        *(line for doubt in doubts for line in _comment(doubt)),
         'robot:',
         f'  driven: [{", ".join(body.driven)}]',
         f'  rates: {str(body.rates).lower()}',
@@ -136,16 +144,31 @@ def noise_of(records: Sequence[Record]) -> Mapping[str, ChannelNoise]:
     }
 
 
-def recorded_drives(records: Sequence[Record], body: Urdf) -> list[str]:
-    """The joints of a robot on which something acted in recordings."""
-    found = []
-    for joint, channel in zip(body.driven, body.inputs, strict=True):
-        position, _ = body.told(joint)
-        acted = (np.any(record.inputs.get(channel, np.zeros(1)) != 0) for record in records)
-        told = (np.ptp(record.inputs.get(position, np.zeros(1))) > 0 for record in records)
-        if any(acted) or any(told):
-            found.append(joint)
-    return found
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent='# ', subsequent_indent='#   ')
+
+
+def _unreal(link: str, before: np.ndarray, after: np.ndarray) -> str:
+    """What was wrong with a link, and what stands in its place."""
+    was, now = (', '.join(f'{x:.3g}' for x in moments) for moments in (before, after))
+    return (
+        f'link {link!r}: no body has the inertia that the URDF gives it, principal moments '
+        f'{was} kg m^2; the nearest that one has is taken, {now}. Correct it if you can'
+    )
+
+
+def _unstated_friction(body: Urdf) -> list[str]:
+    """That every drive rubs, where the URDF says nothing of it."""
+    silent = [
+        joint.name for joint in body.moving
+        if joint.name in body.driven and not joint.damping and not joint.friction
+    ]  # fmt: skip
+    if not silent:
+        return []
+    return [
+        f'the URDF states no friction of {", ".join(silent)}, and drives have some: let `cg '
+        'torques` say how much before you diagnose'
+    ]
 
 
 def _bodies(body: Urdf) -> Iterator[str]:
@@ -184,8 +207,17 @@ def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterat
         yield f'- name: {name}   # {shortened(LIBRARY[name].summary, name)}'
         if len(body.coordinates) > 1:
             yield f'  at: {joint.name}'
-        q = Quantity(value, size.unit, DOUBT * value, source='dynamics in the URDF')
+        q = Quantity(value, size.unit, _doubt(joint, name, value), source='dynamics in the URDF')
         yield f'  parameters: {{{size.name}: {flow(q)}}}'
+
+
+def _doubt(joint: Joint, name: str, value: float) -> float:
+    """Standard deviation of what is believed of friction that a URDF states."""
+    largest = joint.effort
+    if name == 'viscous_friction':
+        largest = joint.effort / joint.velocity if joint.velocity > 0 else 0.0
+    share = DOUBT_OF_LARGEST * largest if 0 < largest < math.inf else 0.0
+    return float(f'{max(DOUBT * value, share):.3g}')
 
 
 def _others(body: Urdf) -> list[str]:
@@ -225,6 +257,14 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     made.add_argument('--driven', metavar='A,B', help='joints with a drive [from the recordings]')
     made.add_argument(
+        '--joints', metavar='A,B',
+        help='joints that move, where others are held still: a hand, a base [all]',
+    )  # fmt: skip
+    made.add_argument(
+        '--held', nargs='+', metavar='JOINT=POSITION', default=[],
+        help='where others are held, in rad or m [as recorded, else 0]',
+    )  # fmt: skip
+    made.add_argument(
         '--out', type=Path, metavar='FILE', help='where to write it [standard output]'
     )
     return made
@@ -238,15 +278,26 @@ def main(args: Sequence[str] | None = None) -> int:
 def work(options: argparse.Namespace) -> int:
     """Read, measure, write."""
     xml = read_text(options.urdf, RobotDescriptionError)
-    description = parse(xml, str(options.urdf))
+    description, unreal = nearest_real(parse(xml, str(options.urdf)))
+    doubts = [_unreal(link, *moments) for link, moments in unreal.items()]
     every = Urdf(description, rates=True)
-    records = [
-        read_bag(path, mechanism=channels.interface(every)) for path in options.joint_states
-    ]
-    driven = options.driven.split(',') if options.driven else driven_joints(xml)
-    if not driven and records:
-        driven = recorded_drives(records, every)
-    text = template(description, driven or None, records, options.urdf.name)
+    raws = [read_raw(path, mechanism=channels.interface(every)) for path in options.joint_states]
+    joints = options.joints.split(',') if options.joints else None
+    positions = held_positions(every, joints, _stated(options.held), raws)
+    if positions:
+        description = description.holding(positions)
+        every = Urdf(description, rates=True)
+        doubts += [f'{name} is held at {at:.6g}' for name, at in positions.items()]
+    stated = [name for name in driven_joints(xml) if name in every.coordinates]
+    driven = options.driven.split(',') if options.driven else stated
+    if not driven and raws:
+        driven = recorded_drives(raws, every)
+    body = Urdf(description, driven or None, rates=True)
+    records = [read_bag(path, mechanism=channels.interface(body)) for path in options.joint_states]
+    doubts += _unstated_friction(body)
+    for doubt in doubts:
+        print(f'cg new-robot: {doubt}', file=sys.stderr)
+    text = template(description, driven or None, records, options.urdf.name, doubts)
     Model.from_text(text, str(options.out or 'new robot'))  # what is written loads
     if options.out is None:
         print(text, end='')
@@ -254,8 +305,22 @@ def work(options: argparse.Namespace) -> int:
     if options.out.exists():
         raise ValueError(f'--out {options.out}: exists already; name another file')
     write_atomically(options.out, text)
-    print(f'{options.out}: {len(every.coordinates)} joints that move', file=sys.stderr)
+    print(f'{options.out}: {len(body.coordinates)} joints that move', file=sys.stderr)
     return 0
+
+
+def _stated(words: Sequence[str]) -> dict[str, float]:
+    """Positions that --held states."""
+    found = {}
+    for word in words:
+        name, _, value = word.partition('=')
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = math.nan
+        if not math.isfinite(found[name]):
+            raise ValueError(f'--held {word}: JOINT=POSITION is needed, in rad or m')
+    return found
 
 
 if __name__ == '__main__':

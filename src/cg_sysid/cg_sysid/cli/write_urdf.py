@@ -16,7 +16,7 @@ from cg_description.model_file import write_atomically
 from cg_description.reading import read_text
 from cg_description.robot_description import RobotDescriptionError, parse, with_inertials
 from cg_dynamics.errors import ModelError
-from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.mechanisms.urdf import Urdf, nearest_real
 from cg_dynamics.model import Model
 from cg_sysid.cli import common as cli
 from cg_sysid.cli.new_robot import FRICTION
@@ -38,12 +38,13 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
         The URDF, a line of MJCF for each joint, and the labels of effects that neither can say.
 
     Raises:
-        ModelError: if the model is of no URDF, or of one with other joints.
+        ModelError: if the model is of no URDF, of one with other joints, or a link would have to
+            weigh less than nothing.
     """
     body = model.mechanism
     if not isinstance(body, Urdf):
         raise ModelError(f'{model.name!r} is a {body.name}; a model of a URDF is needed')
-    given = parse(text)
+    given, _ = nearest_real(parse(text))
     if [j.name for j in given.joints] != [j.name for j in body.description.joints]:
         raise ModelError(f'{model.name!r} has other joints than the URDF {given.name!r}')
     dynamics: dict[str, dict[str, float]] = {}
@@ -63,7 +64,7 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
         for name, values in mjcf.items()
         if values
     ]  # fmt: skip
-    return with_inertials(text, body.inertials(model.values), dynamics), lines, others
+    return with_inertials(text, body.inertials(model.values, given), dynamics), lines, others
 
 
 def parser() -> argparse.ArgumentParser:
