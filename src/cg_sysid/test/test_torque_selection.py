@@ -15,6 +15,8 @@ from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.identification.torque_error import fit_by_torque
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.bags import write_bag
+from cg_sysid.search import torque_selection
+from cg_sysid.search.torque_screening import scores
 from cg_sysid.search.torque_selection import select
 
 OFF = {
@@ -69,6 +71,29 @@ def test_two_laws_of_two_joints_are_taken_up_with_their_sizes(believed):
     for k in (hip, thigh):
         assert found.extended[k] < 0.9 * found.identified[k]
     assert {e.label for e in found.model.effects} > set(sizes)
+
+
+def test_what_all_joints_lack_is_taken_up_at_once(believed, monkeypatch):
+    """Dry friction and rotors, of which the file says nothing; each joint hides the others'."""
+    bare, hidden = believed, []
+    for joint, inertia in zip(believed.mechanism.driven, (0.09, 0.06, 0.03), strict=True):
+        bare = bare.without_effect(f'coulomb_friction@{joint}')
+        hidden.append(('rotor_inertia', joint, {'inertia': inertia}))
+    looks = []
+    monkeypatch.setattr(
+        torque_selection, 'scores', lambda *a, **k: looks.append(a) or scores(*a, **k)
+    )
+    found = select(bare, *ways(machine(believed, *hidden), bare))
+    sizes = {law.label: next(iter(law.parameters.values()))[0] for law in found.laws}
+    true = {
+        'coulomb_friction@hip_joint': 0.3, 'coulomb_friction@thigh_joint': 0.11,
+        'coulomb_friction@shank_joint': 0.1, 'rotor_inertia@hip_joint': 0.09,
+        'rotor_inertia@thigh_joint': 0.06, 'rotor_inertia@shank_joint': 0.03,
+    }  # fmt: skip
+    assert sizes.keys() == true.keys()
+    for label, size in true.items():
+        assert sizes[label] == pytest.approx(size, rel=0.1), label
+    assert len(looks) == 3  # one for each kind, and one that finds nothing more
 
 
 def test_of_laws_that_leave_the_same_the_simplest_is_taken_up(believed):

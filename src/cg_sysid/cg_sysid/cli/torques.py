@@ -192,7 +192,8 @@ def _show_law(console: Console, law: Law, shares: Mapping[str, float]) -> None:
         highlight=False,
     )
     at = [f'{share:.0%} at {joint}' for joint, share in shares.items()]
-    console.print(f'    takes of the squared error: {listed(at)}', highlight=False)
+    takes = f'of the squared error: {listed(at)}' if at else 'the place of numbers off belief'
+    console.print(f'    takes {takes}', highlight=False)
     for rival in law.rivals:
         console.print(f'    or: {effect_name(rival)}', highlight=False)
 

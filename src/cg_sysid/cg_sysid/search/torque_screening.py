@@ -22,7 +22,7 @@ motion is simulated worst: play in a light wrist shows in no torque. A robot of 
 candidates, and a fit of one takes seconds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -118,6 +118,11 @@ class Scores:
         return [(candidate, nats) for candidate, nats in ordered if nats > SEEN]
 
 
+def most_promising(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
+    """Those that gain most by the score, the best first."""
+    return sorted(gains, key=lambda c: -gains[c])[:FITTED]
+
+
 def scores(
     model: Model,
     train: Sequence[DataSet],
@@ -127,7 +132,8 @@ def scores(
     held: Sequence[DataSet] = (),
     missed: Mapping[str, float] | None = None,
     numbers: Mapping[str, float] | None = None,
-    most: int = FITTED,
+    followed: Callable[[Mapping[EffectAt, float]], Sequence[EffectAt]] = most_promising,
+    title: str = 'what torques say',
 ) -> Scores | None:
     """What the torques say of candidates on top of a model.
 
@@ -141,7 +147,9 @@ def scores(
         missed: What the base leaves of each output in simulation, chi2/N, where that is known.
         numbers: Where the base stands (full name -> value), if its torque fit is not to set out
             from the file's numbers.
-        most: Candidates with a D that are fitted, the best first.
+        followed: Of gains by the score, of candidates that torques can tell: those that are
+            fitted.
+        title: What to call the fits.
 
     Returns:
         Their scores; None where torques say nothing.
@@ -158,7 +166,7 @@ def scores(
     noise = _noise(train[0], base.problems, base.by_motion)
     order = np.argsort(-base.fitted.rms / np.maximum(noise, 1e-12))
     worst = _worst([joints[k] for k in order], missed or {})
-    follow = sorted((c for c in gains if not _sensed(c[0])), key=lambda c: -gains[c])[:most]
+    follow = followed({c: gain for c, gain in gains.items() if not _sensed(c[0])})
     promising = {c: [starts[c][k] for k in np.argsort(tests[c])[::-1][:STARTS]] for c in follow}
     for name, at in candidates:
         effect = LIBRARY[name](model.mechanism, at)
@@ -169,7 +177,7 @@ def scores(
     fits = carry_out(
         _best_fit,
         [(base.plain, c, own, train, bounds, base.fitted) for c, own in promising.items()],
-        'what torques say',
+        title,
     )
     extended = {c: found for c, found in zip(promising, fits, strict=True) if found is not None}
     by_fit = {
@@ -196,6 +204,7 @@ class _Base:
         scale: By which to divide each residual, shape (rows, n).
         taken: Orthonormal columns: what its numbers and beliefs can take.
         left: Weighted residual and beliefs, less that.
+        weightless: Its joints without bodies, and without its effects.
     """
 
     plain: Model
@@ -208,6 +217,7 @@ class _Base:
     scale: np.ndarray
     taken: np.ndarray
     left: np.ndarray
+    weightless: Model
 
     @classmethod
     def of(
@@ -243,13 +253,15 @@ class _Base:
         problems = _as_predicted(plain, problems, residual)
         by_motion = [_by_motion(problem, values) for problem in problems]
         return cls(plain, values, unknowns, theta, fitted, problems, by_motion, scale, taken,
-                   left - taken @ (taken.T @ left))  # fmt: skip
+                   left - taken @ (taken.T @ left), _without_bodies(values))  # fmt: skip
 
     def score_tests(
         self, name: str, at: str | None, starts: Sequence[dict[str, float]]
     ) -> list[float] | None:
         """Nats that a candidate could gain from each of its starts; None of one without a D."""
-        columns = _columns(self.model, name, at, starts, self.problems, self.by_motion)
+        columns = _columns(
+            self.model, self.weightless, name, at, starts, self.problems, self.by_motion
+        )
         return None if columns is None else [self._score(start) for start in columns]
 
     def _score(self, columns: np.ndarray) -> float:
@@ -487,8 +499,19 @@ class _Weightless(Urdf):
         return ca.SX(0), ca.SX(0)
 
 
+def _without_bodies(model: Model) -> Model:
+    """The joints of a robot: no effects, no bodies."""
+    body = model.mechanism
+    assert isinstance(body, Urdf)
+    return Model(
+        model.name, _Weightless(body.description, body.driven, body.rates), (),
+        {p.name: model.quantities[p.name] for p in body.parameters}, {}, {}, '', {},
+    )  # fmt: skip
+
+
 def _columns(
     model: Model,
+    weightless: Model,
     name: str,
     at: str | None,
     starts: Sequence[dict[str, float]],
@@ -501,12 +524,7 @@ def _columns(
     # Without bodies gravity pulls at nothing: what turns it has no D either.
     if effect.states or set(effect.extra_inputs) & set(CLOCKS) or overrides(effect, 'up'):
         return None
-    body = model.mechanism
-    assert isinstance(body, Urdf)
-    bare = Model(
-        model.name, _Weightless(body.description, body.driven, body.rates), (),
-        {p.name: model.quantities[p.name] for p in body.parameters}, {}, {}, '', {},
-    )  # fmt: skip
+    bare = weightless
     # What else acts on the same joint makes the load that some laws follow.
     for other in model.effects:
         if other.label != effect.label and other.site == effect.site and not other.states:

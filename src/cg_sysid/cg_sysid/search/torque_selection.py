@@ -2,7 +2,8 @@
 
     torque fit of the numbers -> score tests of all effects (torque_screening.py)
       -> torque fits of the best -> that which gains most is taken up, if records held out gain too
-      -> again on top of it, until none does -> each asked whether the others do without it
+      -> at all other joints as well, if they gain by that
+      -> again on top of these, until none does -> each asked whether the others do without it
 
 A torque fit takes a second where one by simulation takes a minute, and does not mind which
 controller kept the robot on its way. So an arm of six joints has an answer in a minute or two,
@@ -40,7 +41,7 @@ from cg_sysid.search.torque_screening import scores
 from cg_sysid.text import measured
 
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
-MOST = 16  # effects that are taken up
+MOST = 32  # effects that are taken up
 MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
@@ -123,7 +124,8 @@ def select(
             f'model {model.name!r}: torques are compared for a robot of a URDF with an encoder at '
             'every joint that moves'
         )
-    search = _Search(train, held, names, carry_out)
+    judge = _Judge(train, held)
+    search = _Search(judge, names, carry_out)
     plain = torque_error.without_states(model)
     bare = replace(plain, effects=())
     if names is not None and not search.candidates(bare):
@@ -131,22 +133,23 @@ def select(
             f'torques alone cannot tell of {", ".join(names)}: they know little of sensors and '
             'delays, and nothing of pushes and of what moves by itself; use cg diagnose'
         )
-    nominal = base = search.fit(plain, {})
+    nominal = base = judge.fit(plain, {})
     laws: list[Law] = []
     while True:
-        judged = search.on_top(base)
+        judged = search.on_top(base, laws)
         worth = [(law, there) for law, there in judged if not law.reason]
-        if not worth or len(laws) == MOST:
+        if not worth or len(laws) >= MOST:
             break
         least = worth[0][0].nats - settings.SELECTION.margin
         near = [(law, there) for law, there in worth if law.nats > least]
         # A drift that takes minutes is a constant: of what evidence cannot tell, the simplest.
         best, base = min(near, key=lambda pair: len(pair[0].parameters))
         rivals = tuple(law.label for law, _ in near if law is not best)
-        laws.append(replace(best, rivals=rivals))
+        more, base = search.at_other_joints(base)
+        laws += [replace(best, rivals=rivals), *more]
     base, laws = search.doubted(base, laws)
     # Who judged has no more say: the numbers are those of all records.
-    every = replace(search, train=[*train, *held])
+    every = _Judge([*train, *held], held)
     final = every.fit(base.model, base.said.values)
     taken_up = {law.label for law in laws}
     laws = [
@@ -209,13 +212,41 @@ class _Fitted:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _Gain:
+    """What numbers more gain (diagnosis.md, section 4).
+
+    Attributes:
+        nats: Evidence of the records fitted to.
+        significance: Standard errors by which the torque error of records held out falls.
+        taken: Share of the squared torque error of each coordinate that they take, shape (n,).
+        relieved: Part of the evidence, in nats, that is belief in other numbers.
+    """
+
+    nats: float
+    significance: float
+    taken: np.ndarray
+    relieved: float
+
+    @property
+    def believed(self) -> bool:
+        """Whether they take the place of numbers that nobody believes: these lower no error.
+
+        As a payload that of a link too heavy.
+        """
+        return self.relieved > settings.SELECTION.earned
+
+    @property
+    def significant(self) -> bool:
+        """Whether records held out gain."""
+        return self.significance >= (0.0 if self.believed else settings.SELECTION.significant)
+
+
+@dataclass(frozen=True)
+class _Judge:
     """Fits and judgements on one split of the records."""
 
     train: Sequence[DataSet]
     held: Sequence[DataSet]
-    names: Sequence[str] | None
-    carry_out: CarryOut
 
     def fit(self, model: Model, at: Mapping[str, float]) -> _Fitted:
         """A structure fitted by torques, from given values."""
@@ -225,9 +256,10 @@ class _Search:
                 'no torques can be compared: the recordings are shorter than a quarter of a '
                 'second, or positions are missing in all of them'
             )
-        return self._with_errors(model, said)
+        return self.with_errors(model, said)
 
-    def _with_errors(self, model: Model, said: TorqueFit) -> _Fitted:
+    def with_errors(self, model: Model, said: TorqueFit) -> _Fitted:
+        """A torque fit of the records fitted to, and what it leaves in all."""
         standing = model.with_values(said.values)
         train, held = (
             torque_error.left_by(standing, records) for records in (self.train, self.held)
@@ -239,34 +271,7 @@ class _Search:
             )
         return _Fitted(model, said, train, held)
 
-    def candidates(self, model: Model) -> list[EffectAt]:
-        """Effects that may be taken up on top of a model."""
-        setups = [data_set.setup for data_set in (*self.train, *self.held)]
-        recorded = {name for data_set in self.train for name in data_set.input_names}
-        return [
-            candidate
-            for candidate in candidates_for(model, setups, self.names, recorded)
-            if _told_by_torques(model, candidate)
-        ]
-
-    def on_top(self, base: _Fitted) -> list[tuple[Law, _Fitted]]:
-        """Effects on top of a base, fitted and judged: those that the scores promise most of."""
-        found = scores(
-            base.model, self.train, self.candidates(base.model), {}, self.carry_out,
-            numbers=base.said.values, most=FITTED,
-        )  # fmt: skip
-        fits = [self._with_errors(*pair) for pair in found.extended.values()] if found else []
-        if not fits:
-            return []
-        # Each would have its own, and of two that leave the same one would be worth more.
-        independent = min(fits, key=lambda there: there.said.deviance).independent()
-        judged = [
-            (self._law(base, there, there.model.effects[-1].label, independent), there)
-            for there in fits
-        ]
-        return sorted(judged, key=lambda pair: -pair[0].nats)
-
-    def _law(
+    def law(
         self,
         without: _Fitted,
         with_it: _Fitted,
@@ -282,11 +287,24 @@ class _Search:
             independent: Number and share of independent torques, of who leads (independent()).
         """
         sizes = self.sizes(with_it, label)
+        gain = self.gain(without, with_it, len(sizes), independent)
+        reasons = _shortcomings(gain, sizes)
+        reasons += edges_in_words(label, self._at_edge(with_it, label))
+        return Law(label, gain.nats, gain.significance, gain.taken, sizes,
+                   reason='; '.join(reasons))  # fmt: skip
+
+    def gain(
+        self,
+        without: _Fitted,
+        with_it: _Fitted,
+        count: int,
+        independent: tuple[np.ndarray, np.ndarray],
+    ) -> _Gain:
+        """What so many numbers more gain."""
         number, share = independent
         gained = share @ (without.deviance - with_it.deviance) / 2
         relieved = (without.disbelief - with_it.disbelief) / 2
-        gained += relieved
-        nats = gained - len(sizes) / 2 * np.log(number.sum())
+        nats = gained + relieved - count / 2 * np.log(number.sum())
         # Rows in which friction turns are far off with any law: they count as (T) has it.
         before, after = (
             [np.sqrt(deviances(rows, without.said.scale)) for rows in fitted.held]
@@ -294,10 +312,7 @@ class _Search:
         )
         significance = block_gain(before, after, round(block_s(self.held) / STRIDE_S))
         left, was = (scale_of(np.vstack(fitted.held)) for fitted in (with_it, without))
-        taken = 1 - (left / was) ** 2
-        reasons = _shortcomings(float(nats), significance, taken, sizes, relieved)
-        reasons += edges_in_words(label, self._at_edge(with_it, label))
-        return Law(label, float(nats), significance, taken, sizes, reason='; '.join(reasons))
+        return _Gain(float(nats), significance, 1 - (left / was) ** 2, float(relieved))
 
     def _at_edge(self, fitted: _Fitted, label: str) -> dict[str, tuple[float, str]]:
         known = fitted.said.values
@@ -327,20 +342,94 @@ class _Search:
             for u, sigma in zip(unknowns, sigmas, strict=True) if u.name.startswith(own)
         }  # fmt: skip
 
+
+@dataclass(frozen=True)
+class _Search:
+    """Effects, sought on one split of the records."""
+
+    judge: _Judge
+    names: Sequence[str] | None
+    carry_out: CarryOut
+
+    def candidates(self, model: Model) -> list[EffectAt]:
+        """Effects that may be taken up on top of a model."""
+        train, held = self.judge.train, self.judge.held
+        setups = [data_set.setup for data_set in (*train, *held)]
+        recorded = {name for data_set in train for name in data_set.input_names}
+        return [
+            candidate
+            for candidate in candidates_for(model, setups, self.names, recorded)
+            if _told_by_torques(model, candidate)
+        ]
+
+    def on_top(self, base: _Fitted, laws: Sequence[Law]) -> list[tuple[Law, _Fitted]]:
+        """Effects on top of a base with these laws, fitted and judged, the best first."""
+        title = f'what torques say on top of {len(laws)} laws' if laws else 'what torques say'
+        found = scores(
+            base.model, self.judge.train, self.candidates(base.model), {}, self.carry_out,
+            numbers=base.said.values, followed=_followed, title=title,
+        )  # fmt: skip
+        pairs = list(found.extended.values()) if found else []
+        if not pairs:
+            return []
+        # Each would have its own, and of two that leave the same one would be worth more.
+        first = min(pairs, key=lambda pair: pair[1].deviance)
+        independent = self.judge.with_errors(*first).independent()
+        judged = self.carry_out(
+            _judged, [(self.judge, base, *pair, independent) for pair in pairs], title
+        )
+        return sorted(judged, key=lambda pair: -pair[0].nats)
+
+    def at_other_joints(self, base: _Fitted) -> tuple[list[Law], _Fitted]:
+        """The last effect of a base at all other joints as well, if they gain by that.
+
+        Drives are of one make: an arm of which nobody knows the friction lacks some at every
+        joint. What all the others lack hides what one does, and each alone seems to gain little.
+        """
+        last = base.model.effects[-1]
+        others = [
+            (name, at) for name, at in self.candidates(base.model)
+            if name == last.name and last.site in base.model.mechanism.all_joints
+        ]  # fmt: skip
+        if not others:
+            return [], base
+        model, values = base.model, base.standing.values_of(last)
+        for name, at in others:
+            # A heavy joint may have what is out of range at a light one.
+            own = {
+                p.name: min(max(values[p.name], p.lower), p.upper)
+                for p in LIBRARY[name](model.mechanism, at).parameters
+            }
+            model = model.with_effect(name, at, **own)
+        there = self.judge.fit(model, base.said.values)
+        labels = [effect.label for effect in model.effects[-len(others) :]]
+        independent = there.independent()
+        laws = [self.judge.law(base, there, label, independent) for label in labels]
+        count = sum(len(law.parameters) for law in laws)
+        gain = self.judge.gain(base, there, count, independent)
+        if gain.nats < settings.SELECTION.earned or not gain.significant:
+            return [], base
+        return laws, there
+
     def doubted(self, base: _Fitted, laws: Sequence[Law]) -> tuple[_Fitted, list[Law]]:
         """Without those laws that the others do without; what each gains beside the others."""
         laws = list(laws)
         while len(laws) > 1:
             models = [base.model.without_effect(law.label) for law in laws]
+            title = 'each law beside the others'
             said = self.carry_out(
                 torque_error.fit_by_torque,
-                [(model, self.train, None, None, base.said.values) for model in models],
-                'each law beside the others',
+                [(model, self.judge.train, None, None, base.said.values) for model in models],
+                title,
             )
-            lean = [self._with_errors(m, fit) for m, fit in zip(models, said, strict=True)]
+            lean = [self.judge.with_errors(m, fit) for m, fit in zip(models, said, strict=True)]
             independent = base.independent()
-            judged = [self._law(fit, base, law.label, independent)
-                      for fit, law in zip(lean, laws, strict=True)]  # fmt: skip
+            judged = self.carry_out(
+                _Judge.law,
+                [(self.judge, fit, base, law.label, independent)
+                 for fit, law in zip(lean, laws, strict=True)],
+                title,
+            )  # fmt: skip
             idle = [k for k, law in enumerate(judged) if law.reason]
             if not idle:
                 return base, [
@@ -353,21 +442,34 @@ class _Search:
         return base, laws
 
 
-def _shortcomings(
-    nats: float, significance: float, taken: np.ndarray, sizes: Sizes, relieved: float
-) -> list[str]:
-    """Why what an effect gains is not worth it.
+def _judged(
+    judge: _Judge,
+    base: _Fitted,
+    model: Model,
+    said: TorqueFit,
+    independent: tuple[np.ndarray, np.ndarray],
+) -> tuple[Law, _Fitted]:
+    """What the last effect of a model gains on top of a base."""
+    there = judge.with_errors(model, said)
+    return judge.law(base, there, model.effects[-1].label, independent), there
 
-    What takes the place of numbers that nobody believes, as a payload that of a link too heavy,
-    lowers no error: by these it is relieved of so many nats.
-    """
+
+def _followed(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
+    """Those that are fitted: the best by score, and the simpler laws that these turn into."""
+    best = sorted(gains, key=lambda c: -gains[c])[:FITTED]
+    # What takes more numbers than the machine has gains as much, and its fit may end elsewhere.
+    simpler = [(name, at) for kind, at in best for name in LIBRARY[kind].contains]
+    return [c for c in dict.fromkeys([*best, *simpler]) if c in gains]
+
+
+def _shortcomings(gain: _Gain, sizes: Sizes) -> list[str]:
+    """Why what an effect gains is not worth it."""
     found = []
-    if nats < settings.SELECTION.earned:
-        found.append(f'evidence {nats:.1f} nats, {settings.SELECTION.earned:g} needed')
-    believed = relieved > settings.SELECTION.earned
-    if significance < (0.0 if believed else settings.SELECTION.significant):
+    if gain.nats < settings.SELECTION.earned:
+        found.append(f'evidence {gain.nats:.1f} nats, {settings.SELECTION.earned:g} needed')
+    if not gain.significant:
         found.append('no significant gain on recordings held out')
-    if np.nanmax(taken) < MATERIAL and not believed:
+    if np.nanmax(gain.taken) < MATERIAL and not gain.believed:
         found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
     for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
         if abs(size) < settings.SELECTION.too_small * sigma:
