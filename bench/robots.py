@@ -209,13 +209,22 @@ def made(case: Case, folder: Path) -> tuple[Path, list[Path], dict[str, float]]:
     Raises:
         RuntimeError: A bag does not hold what was recorded.
     """
-    robot = ROBOTS[case.robot]
     secret, values = machine(case)
-    text = known_urdf(case)
+    return *written(ROBOTS[case.robot], secret, known_urdf(case), case.seed, folder), values
+
+
+def written(
+    robot: Robot, secret: Secret, text: str, seed: int, folder: Path
+) -> tuple[Path, list[Path]]:
+    """Model file of a URDF, and bags of a robot with a secret.
+
+    Raises:
+        RuntimeError: A bag does not hold what was recorded.
+    """
     body = Urdf(parse(text), robot.driven)
     bags, records = [], []
     for k in range(robot.records):
-        recording = record(robot, secret, 100 * case.seed + k, k)
+        recording = record(robot, secret, 100 * seed + k, k)
         first = START + round(k * (robot.seconds + PAUSE) * NS_PER_S)
         bags.append(folder / f'moves_{k}')
         write_bag(bags[-1], robot, recording, first)
@@ -223,8 +232,8 @@ def made(case: Case, folder: Path) -> tuple[Path, list[Path], dict[str, float]]:
         if not same_either_way(records[-1], in_memory(body, robot, recording, first, 'memory')):
             raise RuntimeError(f'{bags[-1]} does not hold what was recorded')
     model = folder / 'model.yaml'
-    model.write_text(template(parse(text), robot.driven, records, f'{case.robot}.urdf'))
-    return model, bags, values
+    model.write_text(template(parse(text), robot.driven, records, f'{robot.name}.urdf'))
+    return model, bags
 
 
 def labels(case: Case) -> list[str]:
