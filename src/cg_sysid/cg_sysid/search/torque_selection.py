@@ -2,7 +2,7 @@
 
     torque fit of the numbers -> score tests of all effects (torque_screening.py)
       -> torque fits of the best -> that which gains most is taken up, if records held out gain too
-      -> at all other joints as well, if they gain by that
+      -> friction and rotors at all other joints as well, if they gain by that
       -> again on top of these, until none does -> each asked whether the others do without it
 
 A torque fit takes a second where one by simulation takes a minute, and does not mind which
@@ -42,6 +42,7 @@ from cg_sysid.text import measured
 
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
 MOST = 32  # effects that are taken up
+EVERY_DRIVE = 'viscous_friction', 'coulomb_friction', 'rotor_inertia'  # has some of these
 MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
@@ -381,15 +382,15 @@ class _Search:
         return sorted(judged, key=lambda pair: -pair[0].nats)
 
     def at_other_joints(self, base: _Fitted) -> tuple[list[Law], _Fitted]:
-        """The last effect of a base at all other joints as well, if they gain by that.
+        """Friction or a rotor, the last effect of a base, at all other joints, if they gain by it.
 
-        Drives are of one make: an arm of which nobody knows the friction lacks some at every
-        joint. What all the others lack hides what one does, and each alone seems to gain little.
+        An arm of which nobody knows the friction lacks some at every joint. What all the others
+        lack hides what one does, and each alone seems to gain little.
         """
         last = base.model.effects[-1]
         others = [
             (name, at) for name, at in self.candidates(base.model)
-            if name == last.name and last.site in base.model.mechanism.all_joints
+            if name == last.name and name in EVERY_DRIVE
         ]  # fmt: skip
         if not others:
             return [], base
