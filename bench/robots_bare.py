@@ -17,6 +17,7 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,22 +52,37 @@ def machine(robot: Robot) -> tuple[Secret, dict[str, float]]:
     return Secret(armature=rotors), lacks
 
 
+def sound(robot: Robot) -> Case:
+    """The case whose numbers its owner has."""
+    return Case(robot.name, 'sound', 0, '', False)
+
+
+def bare_urdf(robot: Robot) -> str:
+    """The URDF as its owner has it."""
+    return re.sub(r'<dynamics [^>]*/>', '', known_urdf(sound(robot)))
+
+
+def said(model_file: Path, bags: Sequence[Path]) -> TorqueSelection:
+    """What `cg torques` finds, on all cores."""
+    model = Model.load(model_file)
+    loaded = load_bags(bags, model_file, whole=True)
+    train, held = split(prepare(model, loaded.records))
+    workers = os.cpu_count() or 1
+    return select(
+        model, train, held, None,
+        lambda function, arguments, _: run_all(function, arguments, workers),
+    )  # fmt: skip
+
+
 def told(robot: Robot) -> tuple[TorqueSelection, dict[str, float], float]:
     """What the torques say, what the machine has, and the seconds that it took."""
-    case = Case(robot.name, 'sound', 0, '', False)
-    bare = re.sub(r'<dynamics [^>]*/>', '', known_urdf(case))
     secret, lacks = machine(robot)
     with tempfile.TemporaryDirectory() as folder:
-        model_file, bags = written(robot, secret, bare, case.seed, Path(folder))
+        model_file, bags = written(
+            robot, secret, bare_urdf(robot), sound(robot).seed, Path(folder)
+        )
         began = time.monotonic()
-        loaded = load_bags(bags, model_file, whole=True)
-        train, held = split(prepare(Model.load(model_file), loaded.records))
-        workers = os.cpu_count() or 1
-        found = select(
-            Model.load(model_file), train, held, None,
-            lambda function, arguments, _: run_all(function, arguments, workers),
-        )  # fmt: skip
-        return found, lacks, time.monotonic() - began
+        return said(model_file, bags), lacks, time.monotonic() - began
 
 
 def rows_of(robot: Robot) -> tuple[str, list[str]]:

@@ -59,7 +59,13 @@ ACTUATOR = Mapping({
 ROBOT = Mapping({
     'urdf': Key(Text(), 'the URDF itself; `cg new-robot` writes what matters of it'),
     'driven': Key(
-        ListOf(NAME), 'joints with a drive; all that move by themselves if absent', default=None,
+        ListOf(NAME), 'joints and couplings with a drive; all joints that move by themselves if '
+        'absent', default=None,
+    ),
+    'couplings': Key(
+        MapOf(MapOf(Number())), 'motors that turn with several joints, as those of a differential '
+        'do: motor -> joint -> rad that it turns, seen through its own gear, with each rad (m) of '
+        'the joint', default=None,
     ),
     'rates': Key(Flag(), 'true: rates of the joints are measured as well', default=False),
 })  # fmt: skip
@@ -196,7 +202,7 @@ _Dumper.add_representer(
 
 def _robot(robot: dict[str, Any]) -> dict[str, Any]:
     """What `ROBOT` reads, without what is by default."""
-    said = {name: robot[name] for name in ('driven', 'rates') if robot.get(name)}
+    said = {name: robot[name] for name in ('driven', 'couplings', 'rates') if robot.get(name)}
     return {**said, 'urdf': _Block(robot['urdf'])}
 
 

@@ -219,20 +219,6 @@ def parse(text: str, where: str = 'URDF') -> RobotDescription:
     return RobotDescription(robot.get('name') or 'robot', root, tuple(ordered), inertials)
 
 
-def driven_joints(text: str) -> list[str]:
-    """Joints that a URDF gives a drive, by `ros2_control` or `transmission`; [] for none."""
-    robot = Xml.fromstring(text.encode())
-    controlled = [
-        joint.get('name', '')
-        for system in robot.iter('ros2_control')
-        for joint in system.iter('joint')
-        if joint.find('command_interface') is not None
-    ]
-    transmitted = [j.get('name', '') for t in robot.iter('transmission') for j in t.iter('joint')]
-    free = [joint.name for joint in parse(text).independent]
-    return [name for name in free if name in (controlled or transmitted)]
-
-
 def with_inertials(
     text: str,
     inertials: Mapping[str, Inertial | None],

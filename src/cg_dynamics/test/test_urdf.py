@@ -294,6 +294,45 @@ def test_a_model_reads_back_from_its_own_text():
     assert 'link_2_mass' not in model.text()  # what is as in the URDF stays there
 
 
+WRIST = {'motor_a': {'joint_1': 1.0, 'joint_2': 1.0}, 'motor_b': {'joint_1': 1.0, 'joint_2': -1.0}}
+
+
+def test_motors_that_share_joints_are_places_with_or_without_a_torque_of_their_own():
+    text = random_tree(5, 3, slide=0.0)
+    told = robot(text, couplings=WRIST)  # the joints' torques are known
+    for name in ('rotor_inertia', 'coulomb_friction'):
+        assert {*WRIST, 'joint_0'} <= {*LIBRARY[name].sites(told.mechanism)}
+    assert not {*WRIST} & {*LIBRARY['torque_constant'].sites(told.mechanism)}
+    driven = robot(text, couplings=WRIST, driven=['joint_0', *WRIST])
+    assert LIBRARY['torque_constant'].sites(driven.mechanism) == ('joint_0', *WRIST)
+    assert 'joint_1' in LIBRARY['coulomb_friction'].sites(driven.mechanism)
+    again = Model.from_text(driven.with_effect('coulomb_friction', 'motor_b', torque=0.2).text())
+    assert again.mechanism == driven.mechanism != told.mechanism
+    assert pickle.loads(pickle.dumps(driven.mechanism)) == driven.mechanism
+
+
+def test_a_motor_turns_what_its_joints_carry_seen_through_the_ratios():
+    body = Urdf(parse(random_tree(5, 3, slide=0.0)), couplings={
+        'motor_a': {'joint_1': 2.0, 'joint_2': 2.0}, 'motor_b': {'joint_1': 1.0, 'joint_2': 1.0},
+    })  # fmt: skip
+    assert body.inertia_at('motor_a') == pytest.approx(body.inertia_at('motor_b') / 4)
+    assert not body.slides('motor_a')
+
+
+@pytest.mark.parametrize(
+    ('couplings', 'said'),
+    [
+        ({'joint_0': {'joint_1': 1.0, 'joint_2': 1.0}}, 'a joint has that name'),
+        ({'motor': {'joint_1': 1.0, 'elbow': 1.0}}, "'elbow' is no joint that moves by itself"),
+        ({'motor': {'joint_1': 1.0, 'joint_2': 0.0}}, 'two joints at least'),
+        ({'motor': {'joint_1': 1.0}}, 'two joints at least'),
+    ],
+)
+def test_a_coupling_that_is_none_is_named(couplings, said):
+    with pytest.raises(ModelError, match=rf'couplings\.\w+: .*{said}'):
+        robot(random_tree(5, 3), couplings=couplings)
+
+
 def test_a_urdf_needs_its_robot_and_no_other_has_one():
     with pytest.raises(ModelError, match="'urdf' needs an entry 'robot'"):
         mechanism('urdf')

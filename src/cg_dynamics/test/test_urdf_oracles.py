@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 from random_trees import random_tree
 
+from cg_description.model_file import ModelFile
 from cg_description.robot_description import parse
+from cg_dynamics.assemble import assemble, parameter_vector
 from cg_dynamics.mechanisms.urdf import Urdf
+from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 
 # Of the largest entry. MuJoCo turns inertias into principal axes and angles into quaternions and
@@ -104,3 +107,53 @@ def test_a_joint_that_follows_another_obeys_the_chain_rule():
     np.testing.assert_allclose(mass, follow.T @ apart[0] @ follow, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(bias, follow.T @ apart[1], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(taken, follow.T @ apart[2], rtol=1e-12, atol=1e-12)
+
+
+# A motor that two joints share is what MuJoCo calls a fixed tendon: joints weighted and added up,
+# with an inertia and a damping of its own. Its mass matrix has no place for the inertia of a
+# tendon between two branches, so these trees have both joints on one.
+COUPLED = {
+    'motor_a': {'joint_0': 1.3, 'joint_2': 0.8},
+    'motor_b': {'joint_0': 1.1, 'joint_2': -2.0},
+}
+ROTORS, DAMPINGS, TORQUES = (0.37, 0.11), (0.9, 0.25), (4.0, -2.5)
+
+
+@pytest.mark.parametrize('seed', [3, 4, 8])
+def test_motors_of_a_differential_are_as_fixed_tendons_in_mujoco(seed):
+    mujoco = pytest.importorskip('mujoco', reason='MuJoCo is not installed')
+    text = random_tree(seed, 4)
+    spec = mujoco.MjSpec.from_string(text.replace(
+        '</robot>',
+        '<mujoco><compiler fusestatic="false" discardvisual="true"/></mujoco></robot>',
+    ))  # fmt: skip
+    for joint in spec.joints:
+        joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    for (name, ratios), inertia, damping in zip(COUPLED.items(), ROTORS, DAMPINGS, strict=True):
+        tendon = spec.add_tendon(name=name, armature=inertia, damping=[damping, 0, 0])
+        for joint, ratio in ratios.items():
+            tendon.wrap_joint(joint, ratio)
+        motor = spec.add_actuator(name=name, target=name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_TENDON
+        motor.gainprm[0] = 1.0
+    engine = spec.compile()
+    data = mujoco.MjData(engine)
+    model = Model.from_file(ModelFile(
+        name='tree', mechanism='urdf', parameters={},
+        robot={'urdf': text, 'driven': list(COUPLED), 'couplings': COUPLED},
+    ))  # fmt: skip
+    for name, inertia, damping in zip(COUPLED, ROTORS, DAMPINGS, strict=True):
+        model = model.with_effect('rotor_inertia', name, inertia=inertia)
+        model = model.with_effect('viscous_friction', name, coefficient=damping)
+    body = model.mechanism
+    assert body.inputs == ('motor_a_effort', 'motor_b_effort')
+    assert body.input_units == ('N m', 'N m')
+    place = [engine.joint(name).dofadr[0] for name in body.coordinates]
+    q, v, _ = motion(seed, 4)
+    data.qpos[place], data.qvel[place], data.ctrl[:] = q, v, TORQUES
+    mujoco.mj_forward(engine, data)
+    e = assemble(model, Setup())
+    rates = ca.Function('f', [e.x, e.u, e.p], [e.rates])
+    found = rates([*q, *v], TORQUES, parameter_vector(model, Setup()))
+    close(np.asarray(found).ravel()[4:], data.qacc[place])

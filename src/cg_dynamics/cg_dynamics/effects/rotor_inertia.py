@@ -17,8 +17,13 @@ class RotorInertia(Effect):
         ),
     )  # fmt: skip
 
+    @classmethod
+    def sites(cls, mechanism):
+        """Drives, and motors behind a coupling whose joints tell the torques."""
+        return tuple(dict.fromkeys((*mechanism.joints, *mechanism.couplings)))
+
     def energies(self, body, p):
         """Kinetic energy of the rotor."""
-        row = body.mechanism.joints[self.site]
+        row = body.mechanism.all_joints[self.site]
         rate = sum(b * body.v[i] for i, b in enumerate(row))
         return p['inertia'] * rate**2 / 2, 0

@@ -52,7 +52,9 @@ def mechanism(name: str, robot: Mapping[str, Any] | None = None) -> Mechanism:
             description = parse(robot['urdf'], 'robot.urdf')
         except RobotDescriptionError as error:
             raise ModelError(str(error)) from None
-        return Urdf(description, robot.get('driven'), bool(robot.get('rates')))
+        return Urdf(
+            description, robot.get('driven'), bool(robot.get('rates')), robot.get('couplings')
+        )
     try:
         return MECHANISMS[name]
     except KeyError:

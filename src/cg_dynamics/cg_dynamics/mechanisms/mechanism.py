@@ -54,6 +54,8 @@ class Mechanism(ABC):
             generalised force B_j' tau.
         passive: Joint without a drive -> its row; friction acts there as well. Only a mechanism
             that names its joints has any.
+        couplings: Motor that turns with several joints -> joint -> ratio; each has a row among
+            `joints` or `passive`.
         inputs: Input channels, one per actuated joint in the order of `joints`: torques,
             or forces along joints that slide.
         outputs: Output channels, in order.
@@ -75,6 +77,7 @@ class Mechanism(ABC):
     bodies: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     passive: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+    couplings: Mapping[str, Mapping[str, float]] = MappingProxyType({})
     sliding: tuple[str, ...] = ()
     dimensions: int = 2
 

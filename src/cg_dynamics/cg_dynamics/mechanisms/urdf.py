@@ -23,7 +23,7 @@ the URDF.
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
@@ -67,11 +67,15 @@ class Urdf(Mechanism):
 
     Args:
         description: Links and joints.
-        driven: Names of the joints that have a drive; by default all that move by themselves.
+        driven: Names of the joints and couplings that have a drive; by default all joints that
+            move by themselves.
         rates: Whether rates of joints are measured too.
+        couplings: Motor that turns with several joints, as those of a differential do -> joint ->
+            rad that it turns, seen through its own gear, with each rad (m) of the joint.
 
     Raises:
-        ModelError: if nothing moves, a driven joint does not, or no real body has an inertia.
+        ModelError: if nothing moves, a driven or coupled joint does not, a coupling is none, or no
+            real body has an inertia.
     """
 
     def __init__(
@@ -79,24 +83,29 @@ class Urdf(Mechanism):
         description: RobotDescription,
         driven: Sequence[str] | None = None,
         rates: bool = False,
+        couplings: Mapping[str, Mapping[str, float]] | None = None,
     ):
         self.name, self.dimensions = 'urdf', 3
         self.description, self.rates = description, rates
+        self.couplings = {name: dict(ratios) for name, ratios in (couplings or {}).items()}
         self.moving = description.moving
         free = [joint.name for joint in description.independent]
         if not free:
             raise ModelError(f'URDF {description.name!r}: no joint moves')
+        rows = {name: tuple(float(name == other) for other in free) for name in free}
+        for name, ratios in self.couplings.items():
+            rows[name] = self._coupled(name, ratios)
         self.driven = tuple(free if driven is None else driven)
         for name in self.driven:
-            if name not in free:
+            if name not in rows:
                 raise ModelError(
-                    f'driven: {name!r} is no joint that moves by itself; there are: '
-                    f'{", ".join(free)}'
+                    f'driven: {name!r} is no joint that moves by itself'
+                    f'{" and no coupling" if self.couplings else ""}; there are: '
+                    f'{", ".join(rows)}'
                 )
-        rows = {name: tuple(float(name == other) for other in free) for name in free}
         self.coordinates = tuple(free)
         self.joints = {name: rows[name] for name in self.driven}
-        self.passive = {name: rows[name] for name in free if name not in self.driven}
+        self.passive = {name: row for name, row in rows.items() if name not in self.driven}
         self.sliding = tuple(j.name for j in description.independent if j.slides)
         self.inputs = tuple(f'{name}_effort' for name in self.driven)
         units = ['m' if name in self.sliding else 'rad' for name in free]
@@ -116,10 +125,30 @@ class Urdf(Mechanism):
         )
         self.parameters = self._determined()
 
+    def _coupled(self, name: str, ratios: Mapping[str, float]) -> tuple[float, ...]:
+        """The row of a coupling."""
+        free = [joint.name for joint in self.description.independent]
+        where = f'couplings.{name}'
+        if name in (joint.name for joint in self.description.joints):
+            raise ModelError(f'{where}: a joint has that name; give the motor another one')
+        if strangers := [joint for joint in ratios if joint not in free]:
+            raise ModelError(
+                f'{where}: {strangers[0]!r} is no joint that moves by itself; there are: '
+                f'{", ".join(free)}'
+            )
+        if sum(ratio != 0 for ratio in ratios.values()) < 2:
+            raise ModelError(f'{where}: two joints at least, each with a ratio that is not 0')
+        return tuple(float(ratios.get(joint, 0.0)) for joint in free)
+
+    def slides(self, joint: str) -> bool:
+        """Whether a joint moves along a line; the motor of a coupling turns."""
+        return joint in self.sliding
+
     def inertia_at(self, joint: str) -> float:
-        """By the URDF, the mean over some poses."""
+        """By the URDF, the mean over some poses; of a coupling where its joints share the way."""
         row = np.array(self.all_joints[joint])
-        return float(row @ self._inertia @ row)
+        way = row / (row @ row)
+        return float(way @ self._inertia @ way)
 
     @cached_property
     def _inertia(self) -> np.ndarray:
@@ -140,6 +169,8 @@ class Urdf(Mechanism):
     def identity(self) -> str:
         """Name of this very robot: two that differ in a number or a joint have other ones."""
         said = f'{self._text}|{self.driven}|{self.rates}'
+        if self.couplings:
+            said += f'|{self.couplings}'
         return f'urdf:{hashlib.sha256(said.encode()).hexdigest()[:16]}'
 
     def __eq__(self, other):
@@ -150,7 +181,8 @@ class Urdf(Mechanism):
 
     # Models travel between processes all the time, and what follows from a URDF takes a while.
     def __reduce__(self):
-        return _known, (self._text, self.driven, self.rates)
+        couplings = tuple((name, tuple(own.items())) for name, own in self.couplings.items())
+        return _known, (self._text, self.driven, self.rates, couplings)
 
     @cached_property
     def _text(self) -> str:
@@ -163,6 +195,7 @@ class Urdf(Mechanism):
             'urdf': self._text,
             'driven': None if every else list(self.driven),
             'rates': self.rates,
+            'couplings': self.couplings or None,
         }
 
     def up(self, setup: Setup) -> ca.SX:
@@ -457,9 +490,14 @@ class Urdf(Mechanism):
 
 
 @lru_cache(maxsize=16)
-def _known(text: str, driven: tuple[str, ...], rates: bool) -> Urdf:
+def _known(
+    text: str,
+    driven: tuple[str, ...],
+    rates: bool,
+    couplings: tuple[tuple[str, tuple[tuple[str, float], ...]], ...],
+) -> Urdf:
     """The robot of a URDF, once a process."""
-    return Urdf(parse(text), driven, rates)
+    return Urdf(parse(text), driven, rates, {name: dict(own) for name, own in couplings})
 
 
 class _Body:

@@ -23,9 +23,9 @@ from cg_description.robot_description import (
     Joint,
     RobotDescription,
     RobotDescriptionError,
-    driven_joints,
     parse,
 )
+from cg_description.transmissions import couplings, driven_joints
 from cg_dynamics.effects import LIBRARY
 from cg_dynamics.mechanisms.urdf import BELIEF, Urdf, nearest_real
 from cg_dynamics.model import Model
@@ -76,6 +76,7 @@ def template(
     records: Sequence[Record],
     source: str,
     doubts: Sequence[str] = (),
+    coupled: Mapping[str, Mapping[str, float]] | None = None,
 ) -> str:
     """The text of a model file for a robot, with comments.
 
@@ -85,11 +86,12 @@ def template(
         records: Recordings of it, of an interface with rates.
         source: Where the description comes from, in words.
         doubts: What somebody should look at in the description, sentences.
+        coupled: Motors that turn with several joints, as `Urdf` takes them.
     """
     rates = bool(records) and all(
         f'{j.name}_velocity' in r.outputs for r in records for j in description.independent
     )
-    body = Urdf(description, driven, rates)
+    body = Urdf(description, driven, rates, coupled)
     noises = noise_of(records)
     follows = any(set(record.inputs) & set(record.mechanism.told_names) for record in records)
     effects = [*_effects(body, description, follows)]
@@ -106,6 +108,7 @@ def template(
         *(line for doubt in doubts for line in _comment(doubt)),
         'robot:',
         f'  driven: [{", ".join(body.driven)}]',
+        *_couplings(body),
         f'  rates: {str(body.rates).lower()}',
         '  urdf: |',
         *(f'    {line}' for line in description.text().splitlines()),
@@ -124,7 +127,7 @@ def template(
     lines += ['', '# What each drive can do: it clips to `limit`.', 'actuators:']
     by_name = {joint.name: joint for joint in description.joints}
     for joint, channel, unit in zip(body.driven, body.inputs, body.input_units, strict=True):
-        lines += list(_actuator(by_name[joint], channel, unit))
+        lines += list(_actuator(by_name.get(joint), channel, unit))
     lines += ['', 'provenance:   # any keys: who wrote this file, and when', f'  source: {source}',
               '']  # fmt: skip
     return '\n'.join(lines)
@@ -169,6 +172,13 @@ def _unstated_friction(body: Urdf) -> list[str]:
         f'the URDF states no friction of {", ".join(silent)}, and drives have some: let `cg '
         'torques` say how much before you diagnose'
     ]
+
+
+def _couplings(body: Urdf) -> Iterator[str]:
+    if body.couplings:
+        yield '  couplings:   # motor -> rad that it turns, behind its gear, per rad of a joint'
+    for name, ratios in body.couplings.items():
+        yield f'    {name}: {{{", ".join(f"{j}: {r!r}" for j, r in ratios.items())}}}'
 
 
 def _bodies(body: Urdf) -> Iterator[str]:
@@ -236,9 +246,9 @@ def _sensor(channel: str, unit: str, noise: ChannelNoise | None) -> Iterator[str
             yield f'    # {key}: {{value: ..., unit: {unit}, source: ...}}'
 
 
-def _actuator(joint: Joint, channel: str, unit: str) -> Iterator[str]:
+def _actuator(joint: Joint | None, channel: str, unit: str) -> Iterator[str]:
     yield f'  {channel}:'
-    if math.isfinite(joint.effort) and joint.effort > 0:
+    if joint is not None and math.isfinite(joint.effort) and joint.effort > 0:
         q = Quantity(joint.effort, unit, source='effort limit in the URDF')
         yield f'    limit: {flow(q)}'
     else:
@@ -255,7 +265,10 @@ def parser() -> argparse.ArgumentParser:
         '--joint-states', nargs='+', metavar='BAG', default=[],
         help='recordings with /joint_states: which joints are driven, and how well they measure',
     )  # fmt: skip
-    made.add_argument('--driven', metavar='A,B', help='joints with a drive [from the recordings]')
+    made.add_argument(
+        '--driven', metavar='A,B',
+        help='joints with a drive, or motors that joints share [from the recordings]',
+    )  # fmt: skip
     made.add_argument(
         '--joints', metavar='A,B',
         help='joints that move, where others are held still: a hand, a base [all]',
@@ -292,12 +305,18 @@ def work(options: argparse.Namespace) -> int:
     driven = options.driven.split(',') if options.driven else stated
     if not driven and raws:
         driven = recorded_drives(raws, every)
-    body = Urdf(description, driven or None, rates=True)
+    # A joint that is held couples nothing.
+    coupled = {
+        motor: ratios
+        for motor, ratios in couplings(xml).items()
+        if {*ratios} <= {*every.coordinates}
+    }
+    body = Urdf(description, driven or None, True, coupled)
     records = [read_bag(path, mechanism=channels.interface(body)) for path in options.joint_states]
     doubts += _unstated_friction(body)
     for doubt in doubts:
         print(f'cg new-robot: {doubt}', file=sys.stderr)
-    text = template(description, driven or None, records, options.urdf.name, doubts)
+    text = template(description, driven or None, records, options.urdf.name, doubts, coupled)
     Model.from_text(text, str(options.out or 'new robot'))  # what is written loads
     if options.out is None:
         print(text, end='')
@@ -305,7 +324,10 @@ def work(options: argparse.Namespace) -> int:
     if options.out.exists():
         raise ValueError(f'--out {options.out}: exists already; name another file')
     write_atomically(options.out, text)
-    print(f'{options.out}: {len(body.coordinates)} joints that move', file=sys.stderr)
+    print(
+        f'{options.out}: {len(body.coordinates)} joints that move; {description.root!r} stands '
+        'still', file=sys.stderr,
+    )  # fmt: skip
     return 0
 
 

@@ -504,7 +504,7 @@ def _without_bodies(model: Model) -> Model:
     body = model.mechanism
     assert isinstance(body, Urdf)
     return Model(
-        model.name, _Weightless(body.description, body.driven, body.rates), (),
+        model.name, _Weightless(body.description, body.driven, body.rates, body.couplings), (),
         {p.name: model.quantities[p.name] for p in body.parameters}, {}, {}, '', {},
     )  # fmt: skip
 
