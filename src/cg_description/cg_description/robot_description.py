@@ -128,6 +128,13 @@ class RobotDescription:
         """The joints that move and follow no other."""
         return tuple(joint for joint in self.moving if joint.mimic is None)
 
+    def stranger(self, name: str) -> str:
+        """What is wrong with a name that is no joint that moves by itself; empty if it is one."""
+        free = [joint.name for joint in self.independent]
+        if name in free:
+            return ''
+        return f'{shown(name)} is no joint that moves by itself; there are: {", ".join(free)}'
+
     def holding(self, positions: Mapping[str, float]) -> 'RobotDescription':
         """This robot with some joints fixed, and with them those that follow them.
 
@@ -137,12 +144,9 @@ class RobotDescription:
         Raises:
             RobotDescriptionError: One of them does not move by itself.
         """
-        free = [joint.name for joint in self.independent]
         for name in positions:
-            if name not in free:
-                raise RobotDescriptionError(
-                    f'{shown(name)} is no joint that moves by itself; there are: {", ".join(free)}'
-                )
+            if stranger := self.stranger(name):
+                raise RobotDescriptionError(stranger)
         joints = []
         for joint in self.joints:
             leader, ratio, offset = joint.mimic or (joint.name, 1.0, 0.0)

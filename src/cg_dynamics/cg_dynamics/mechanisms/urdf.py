@@ -97,12 +97,9 @@ class Urdf(Mechanism):
             rows[name] = self._coupled(name, ratios)
         self.driven = tuple(free if driven is None else driven)
         for name in self.driven:
-            if name not in rows:
-                raise ModelError(
-                    f'driven: {name!r} is no joint that moves by itself'
-                    f'{" and no coupling" if self.couplings else ""}; there are: '
-                    f'{", ".join(rows)}'
-                )
+            if name not in self.couplings and (stranger := description.stranger(name)):
+                others = ', '.join(['', *self.couplings])
+                raise ModelError(f'driven: {stranger}{others}')
         self.coordinates = tuple(free)
         self.joints = {name: rows[name] for name in self.driven}
         self.passive = {name: row for name, row in rows.items() if name not in self.driven}
@@ -127,18 +124,15 @@ class Urdf(Mechanism):
 
     def _coupled(self, name: str, ratios: Mapping[str, float]) -> tuple[float, ...]:
         """The row of a coupling."""
-        free = [joint.name for joint in self.description.independent]
         where = f'couplings.{name}'
         if name in (joint.name for joint in self.description.joints):
             raise ModelError(f'{where}: a joint has that name; give the motor another one')
-        if strangers := [joint for joint in ratios if joint not in free]:
-            raise ModelError(
-                f'{where}: {strangers[0]!r} is no joint that moves by itself; there are: '
-                f'{", ".join(free)}'
-            )
+        for joint in ratios:
+            if stranger := self.description.stranger(joint):
+                raise ModelError(f'{where}: {stranger}')
         if sum(ratio != 0 for ratio in ratios.values()) < 2:
             raise ModelError(f'{where}: two joints at least, each with a ratio that is not 0')
-        return tuple(float(ratios.get(joint, 0.0)) for joint in free)
+        return tuple(float(ratios.get(j.name, 0.0)) for j in self.description.independent)
 
     def slides(self, joint: str) -> bool:
         """Whether a joint moves along a line; the motor of a coupling turns."""
@@ -206,11 +200,8 @@ class Urdf(Mechanism):
         """All joints but those that the set-up locks."""
         locked = dict(setup.locked)
         for name in locked:
-            if name not in self.coordinates:
-                raise ModelError(
-                    f'setup.locked: {name!r} is no joint that moves by itself; there are: '
-                    f'{", ".join(self.coordinates)}'
-                )
+            if stranger := self.description.stranger(name):
+                raise ModelError(f'setup.locked: {stranger}')
         free = [k for k, name in enumerate(self.coordinates) if name not in locked]
         if not free:
             raise ModelError('setup.locked: nothing is left to move')

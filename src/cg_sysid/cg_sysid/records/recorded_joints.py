@@ -54,10 +54,8 @@ def held_positions(
     free = body.coordinates
     moving = [name for name in free if name not in stated] if joints is None else list(joints)
     for name in (*moving, *stated):
-        if name not in free:
-            raise ValueError(
-                f'{name!r} is no joint that moves by itself; there are: {", ".join(free)}'
-            )
+        if stranger := body.description.stranger(name):
+            raise ValueError(stranger)
         if name in moving and name in stated:
             raise ValueError(f'{name!r} is among --joints, which move, and among --held')
     found = {}
