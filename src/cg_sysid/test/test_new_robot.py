@@ -12,6 +12,7 @@ from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
 from cg_interfaces import channels
+from cg_sysid.cli.diagnose import main as diagnose
 from cg_sysid.cli.new_robot import main, template
 from cg_sysid.records.bags import write_bag
 
@@ -79,6 +80,8 @@ def test_a_urdf_that_knows_no_friction_is_told_so(leg, capsys):
     said = 'the URDF states no friction of hip_joint, shank_joint, and drives have some'
     assert said in capsys.readouterr().err
     assert said in (leg / 'leg.yaml').read_text()
+    diagnose(['--model', str(leg / 'leg.yaml'), '--out', str(leg / 'answer'), 'no_such_bag'])
+    assert 'no friction at hip_joint, shank_joint; let `cg torques`' in capsys.readouterr().err
 
 
 def test_where_a_joint_is_held_can_be_stated(leg):

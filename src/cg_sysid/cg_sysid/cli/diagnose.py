@@ -31,6 +31,7 @@ from cg_sysid.deadline import Deadline
 from cg_sysid.diagnosis.diagnose import diagnose
 from cg_sysid.diagnosis.result import Diagnosis, Options
 from cg_sysid.experiments.catalogue import experiments_for
+from cg_sysid.identification.joint_friction import drives_without_friction
 from cg_sysid.progress import Bars
 from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import curves, write_report
@@ -93,6 +94,16 @@ def main(args: Sequence[str] | None = None) -> int:
     return cli.run('cg diagnose', work, parser().parse_args(args))
 
 
+def _print_torques_first(model: Model, quiet: bool) -> None:
+    """That another command is quicker where a robot's file knows the bodies and little else."""
+    silent = drives_without_friction(model)
+    if len(silent) > 1 and not quiet:
+        print(
+            f'cg diagnose: the model has no friction at {", ".join(silent)}; let `cg torques` say '
+            'how much first, as a diagnosis adds one effect at a time', file=sys.stderr,
+        )  # fmt: skip
+
+
 def work(options: argparse.Namespace) -> int:
     """Read, check, diagnose, write."""
     if options.rounds < 1:
@@ -110,6 +121,7 @@ def work(options: argparse.Namespace) -> int:
     model = Model.load(model_file)
     effects = cli.chosen_effects(options.effects, model)
     note = cli.load_note(options.note)
+    _print_torques_first(model, options.quiet)
     fitters = Cluster(options.scheduler) if options.scheduler is not None else nullcontext()
     with fitters as executor, Bars('cg diagnose', options.quiet) as bars:
         loaded = load_bags(

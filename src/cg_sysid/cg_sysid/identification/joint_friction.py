@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cg_dynamics.mechanisms.urdf import Urdf
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
@@ -27,6 +28,15 @@ class JointFriction:
     rate: np.ndarray
     measured: np.ndarray
     modelled: np.ndarray
+
+
+def drives_without_friction(model: Model) -> tuple[str, ...]:
+    """Driven joints of a robot of a URDF at which no law of the model opposes motion."""
+    body = model.mechanism
+    if not isinstance(body, Urdf):
+        return ()
+    rub = {effect.site for effect in model.effects if effect.friction}
+    return tuple(joint for joint in body.driven if joint not in rub)
 
 
 def friction_of(model: Model, data_sets: Sequence[DataSet]) -> dict[str, JointFriction]:
