@@ -356,7 +356,7 @@ def farthest(says: dict[str, float]) -> str:
 def table_of(rows: list[dict[str, Any]], ours: dict[str, dict[str, Any]]) -> list[str]:
     """A line for each case."""
     lines = [
-        '| case | where | ours: causes | chi2/N: file, found | CPU s '
+        '| case | where | ours: causes | chi2/N: identified, with causes | CPU s '
         '| least squares: torque left, worst drive | changed most (share of torques) '
         '| mujoco.sysid: chi2/N: file, found | moved most | CPU s |',
         '|---|---|---|---:|---:|---:|---|---:|---|---:|',
@@ -437,8 +437,11 @@ def main() -> int:
         versions = {row['version'] for row in ours.values()} | {shown[0]['version']}
         options.write.write_text('\n'.join([
             '# The diagnosis and its peers on robots of a URDF', '',
-            'Command: `./cg exec python bench/robots_peers.py`; this table of its rows: the same '
-            f'with `--table-only --write FILE`. Sources {", ".join(sorted(versions))}.',
+            f'Command: `./cg exec python bench/robots_peers.py {" ".join(options.patterns)}`, with '
+            f'`--toolbox {options.toolbox!r} --seconds {options.seconds:g}`; this table of its '
+            'rows: the same with `--table-only --write FILE`. The diagnoses are those of '
+            '`bench/robots.py`, on both cores each, with the CPU time of all workers. Sources '
+            f'{", ".join(sorted(versions))}.',
             'What the peers are and get is written at the head of the bench.', '', *lines, '',
         ]))  # fmt: skip
     return 0
