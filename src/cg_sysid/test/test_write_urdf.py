@@ -62,6 +62,26 @@ def test_the_urdf_moves_as_the_model_does(files, capsys):
     np.testing.assert_allclose(*taken, rtol=1e-9)
 
 
+def test_a_motor_that_joints_share_is_a_tendon_of_mjcf(tmp_path, capsys):
+    mujoco = pytest.importorskip('mujoco', reason='MuJoCo is not installed')
+    shared = {'knee_motor': {'thigh_joint': 1.0, 'shank_joint': -2.5}}
+    model = Model.from_file(ModelFile(
+        name='leg', mechanism='urdf', parameters={}, robot={'urdf': urdf(), 'couplings': shared},
+    )).with_effect('coulomb_friction', 'knee_motor', torque=0.4)  # fmt: skip
+    model.with_effect('rotor_inertia', 'knee_motor', inertia=0.03).save(tmp_path / 'model.yaml')
+    (tmp_path / 'robot.urdf').write_text(urdf())
+    words = [str(tmp_path / name) for name in ('model.yaml', 'robot.urdf')]
+    assert main([*words, '--out', str(tmp_path / 'new.urdf')]) == 0
+    said = capsys.readouterr().out
+    mjcf = mujoco.MjSpec.from_string((tmp_path / 'new.urdf').read_text()).to_xml()
+    engine = mujoco.MjModel.from_xml_string(
+        mjcf.replace('</mujoco>', f'<tendon>{said}</tendon></mujoco>')
+    )
+    assert engine.tendon_frictionloss[0] == pytest.approx(0.4)
+    assert engine.tendon_armature[0] == pytest.approx(0.03)
+    assert sorted(engine.wrap_prm) == [-2.5, 1.0]
+
+
 def moved_at(text, held, q):
     """Torques of a URDF that is held so, at a motion of the rest."""
     body = Urdf(parse(text).holding(held))

@@ -3,13 +3,14 @@
     cg write-urdf answer/model.yaml my.urdf --out my_identified.urdf
 
 Inertias of links, damping and friction of joints are those of the model; all else of the URDF
-stays. What a URDF cannot say is printed: armature, damping and frictionloss as MJCF has them, and
-the effects that only the model file knows.
+stays. What a URDF cannot say is printed: armature, damping and frictionloss as MJCF has them, of
+joints and of the tendons that motors shared by several joints are there, and the effects that only
+the model file knows.
 """
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cg_description.model_file import write_atomically
@@ -21,7 +22,7 @@ from cg_dynamics.model import Model
 from cg_sysid.cli import common as cli
 from cg_sysid.cli.new_robot import FRICTION
 
-# Effect -> what an MJCF joint calls its size.
+# Effect -> what a joint and a tendon of MJCF call its size.
 MJCF = {
     'viscous_friction': 'damping', 'coulomb_friction': 'frictionloss', 'rotor_inertia': 'armature',
 }  # fmt: skip
@@ -35,7 +36,8 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
         text: That URDF, shapes and all.
 
     Returns:
-        The URDF, a line of MJCF for each joint, and the labels of effects that neither can say.
+        The URDF, lines of MJCF for joints and tendons, and the labels of effects that neither
+        can say.
 
     Raises:
         ModelError: if the model is of no URDF, of one with other joints, or a link would have to
@@ -48,7 +50,7 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
     if [j.name for j in given.joints] != [j.name for j in body.description.joints]:
         raise ModelError(f'{model.name!r} has other joints than the URDF {given.name!r}')
     dynamics: dict[str, dict[str, float]] = {}
-    mjcf: dict[str, dict[str, float]] = {name: {} for name in body.coordinates}
+    mjcf: dict[str, dict[str, float]] = {name: {} for name in body.all_joints}
     others = []
     for effect in model.effects:
         if effect.name not in MJCF:
@@ -56,15 +58,22 @@ def written(model: Model, text: str) -> tuple[str, list[str], list[str]]:
             continue
         value = model.values_of(effect)[effect.parameters[0].name]
         mjcf[effect.site][MJCF[effect.name]] = value
-        if effect.name in FRICTION:
+        if effect.name in FRICTION and effect.site not in body.couplings:
             dynamics.setdefault(effect.site, {})[FRICTION[effect.name]] = value
-    lines = [
-        f'<joint name="{name}" '
-        + ' '.join(f'{key}="{value:.6g}"' for key, value in values.items()) + '/>'
-        for name, values in mjcf.items()
-        if values
-    ]  # fmt: skip
+    lines: list[str] = []
+    for name, values in mjcf.items():
+        if values:
+            lines += _mjcf(name, values, body.couplings.get(name, {}))
     return with_inertials(text, body.inertials(model.values, given), dynamics), lines, others
+
+
+def _mjcf(name: str, values: Mapping[str, float], ratios: Mapping[str, float]) -> list[str]:
+    """A joint, or the tendon that turns with several joints, each by a ratio."""
+    said = ' '.join(f'{key}="{value:.6g}"' for key, value in values.items())
+    if not ratios:
+        return [f'<joint name="{name}" {said}/>']
+    turned = [f'  <joint joint="{joint}" coef="{ratio:.6g}"/>' for joint, ratio in ratios.items()]
+    return [f'<fixed name="{name}" {said}>', *turned, '</fixed>']
 
 
 def parser() -> argparse.ArgumentParser:
