@@ -437,8 +437,8 @@ def main() -> int:
         versions = {row['version'] for row in ours.values()} | {shown[0]['version']}
         options.write.write_text('\n'.join([
             '# The diagnosis and its peers on robots of a URDF', '',
-            f'Command: `./cg exec python bench/robots_peers.py {" ".join(options.patterns)}`, with '
-            f'`--toolbox {options.toolbox!r} --seconds {options.seconds:g}`; this table of its '
+            f'Command: `./cg exec python bench/robots_peers.py {" ".join(options.patterns)}`, '
+            f'with `--toolbox {options.toolbox!r} --seconds {options.seconds:g}`; this table of its '
             'rows: the same with `--table-only --write FILE`. The diagnoses are those of '
             '`bench/robots.py`, on both cores each, with the CPU time of all workers. Sources '
             f'{", ".join(sorted(versions))}.',
