@@ -438,8 +438,8 @@ def main() -> int:
         options.write.write_text('\n'.join([
             '# The diagnosis and its peers on robots of a URDF', '',
             f'Command: `./cg exec python bench/robots_peers.py {" ".join(options.patterns)}`, '
-            f'with `--toolbox {options.toolbox!r} --seconds {options.seconds:g}`; this table of its '
-            'rows: the same with `--table-only --write FILE`. The diagnoses are those of '
+            f'with `--toolbox {options.toolbox!r} --seconds {options.seconds:g}`; this table of '
+            'its rows: the same with `--table-only --write FILE`. The diagnoses are those of '
             '`bench/robots.py`, on both cores each, with the CPU time of all workers. Sources '
             f'{", ".join(sorted(versions))}.',
             'What the peers are and get is written at the head of the bench.', '', *lines, '',
