@@ -205,7 +205,11 @@ def test_a_new_model_file_has_the_loops_of_drives_that_were_told_positions(robot
     assert new_robot(words) == 0
     loops = [effect for effect in Model.load(out).effects if effect.name == 'position_control']
     assert [effect.site for effect in loops] == ['hip_joint', 'shank_joint']
-    assert 'state the gains of the drive' in out.read_text()
+    text = out.read_text()
+    assert 'state the gains of the drive' in text
+    adding = text.replace('# - {name: integral_control', '- {name: integral_control')
+    added = [e.site for e in Model.from_text(adding).effects if e.name == 'integral_control']
+    assert added == ['hip_joint', 'shank_joint']
 
 
 def test_a_simulated_machine_says_that_it_takes_torques():
@@ -268,16 +272,18 @@ def following(
         told = np.arange(0, seconds, 0.01)
         commands = np.array([at(t)[0] for t in told])
 
-        total = holding.copy()
+        total, before = holding.copy(), [0.0, NONE, start]
 
-        def tells(time, q, v, commands=commands, total=total):
-            told = commands[int(time / 0.01 + 1e-6)]
-            total += integral * (told - q) * mujoco_tree.SAMPLE  # as a drive adds up
-            return told
+        def tells(time, q, v, commands=commands, total=total, before=before):
+            since, told, place = before  # as a drive adds up, of what it was told since then
+            total += integral * (time - since) * (told - (place + q) / 2)
+            before[:] = time, commands[int(time / 0.01 + 1e-6)], q
+            return before[1]
 
-        def follows(time, q, v, held, total=total):
+        def follows(time, q, v, held, total=total, before=before):
             # What is held is applied as a torque; here it is where to be.
-            return k * (held - q) - d * v + total + law(q, v) - held
+            summed = total + integral * (time - before[0]) * (held - q)
+            return k * (held - q) - d * v + summed + law(q, v) - held
 
         made = mujoco_tree.record(
             urdf(), JOINTS, tells, seconds - 0.01, start,
@@ -358,3 +364,22 @@ def test_the_integral_part_of_a_drive_is_named(robot, tmp_path):
     # Of torques and inertias only the ratio is known, and bodies are believed to 15 %.
     assert value == pytest.approx(260.0, abs=2 * sigma)
     assert 0 < sigma < 0.15 * 260.0
+
+
+def test_drives_that_all_add_up_are_identified_from_any_gains(robot, tmp_path):
+    """What they hold is no torque that somebody measured: it may not lead the masses astray."""
+    gains = dict(zip(JOINTS, (220.0, 260.0, 90.0), strict=True))
+    records = following(
+        tmp_path, robot, count=2, integral=np.array([*gains.values()]),
+        holding=np.array([0.5, 1.5, -0.3]),
+    )  # fmt: skip
+    model = without_dry_friction(followed())
+    for joint, gain in gains.items():
+        model = model.with_effect('integral_control', joint, gain=0.4 * gain)
+    only = [n for n in model.declarations if n.startswith('integral_control')]
+    found = fit(model, prepare(model, records), only=only)
+    assert found.normalised_error < 1.15  # rounding to counts is not quite white
+    for unknown, value in zip(found.unknowns, found.values, strict=True):
+        joint = unknown.name.partition('@')[2].partition('.')[0]
+        assert value == pytest.approx(gains[joint], rel=0.001)
+    assert fit(model, prepare(model, records)).normalised_error < 1.15  # bodies too

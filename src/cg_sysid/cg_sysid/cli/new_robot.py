@@ -63,6 +63,7 @@ OTHERS = """\
 """
 WIDTH = 99
 GUESSED = 'guessed: state the gains of the drive'
+ADDS_UP = 'Drives that add up their errors, PI or PID, have these as well:'
 # Friction in a URDF is a guess more often than not, and often a placeholder: so far it may be off,
 # relative, and as a share of the largest torque (at the largest rate).
 DOUBT, DOUBT_OF_LARGEST = 0.5, 0.05
@@ -206,6 +207,11 @@ def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterat
             yield f'  at: {driven}'
         yield '  parameters:'
         yield from (f'    {name}: {gain}' for name, gain in gains.items())
+    if follows:
+        yield from _comment(ADDS_UP)
+        for driven in body.driven:
+            at = f', at: {driven}' if len(body.coordinates) > 1 else ''
+            yield f'# - {{name: integral_control{at}}}'
     stated = [
         (joint, name, getattr(joint, attribute))
         for joint in description.independent

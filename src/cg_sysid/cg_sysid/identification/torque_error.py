@@ -74,10 +74,14 @@ class TorqueFit:
 def can(model: Model) -> bool:
     """Whether this is of use: a robot of a URDF with an encoder at every joint that moves.
 
-    Mechanisms of a few joints are followed by simulation from the start.
+    Mechanisms of a few joints are followed by simulation from the start, and so are robots of
+    which a drive holds a torque that nobody wrote down.
     """
     encoders = sum(kind == 'encoder' for kind in model.mechanism.sensor_kinds.values())
-    return model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates)
+    told = not any(effect.states and effect.extra_inputs for effect in acting_effects(model))
+    return (
+        model.mechanism.dimensions == 3 and encoders >= len(model.mechanism.coordinates) and told
+    )
 
 
 def fit_by_torque(
