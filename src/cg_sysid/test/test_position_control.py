@@ -366,6 +366,20 @@ def test_the_integral_part_of_a_drive_is_named(robot, tmp_path):
     assert 0 < sigma < 0.15 * 260.0
 
 
+@pytest.mark.slow
+@pytest.mark.evidence
+def test_the_integral_parts_of_all_drives_are_named(robot, tmp_path):
+    """Each hides what the others would gain."""
+    records = following(
+        tmp_path, robot, count=4, integral=np.array([220.0, 260.0, 90.0]),
+        holding=np.array([0.5, 1.5, -0.3]),
+    )  # fmt: skip
+    effects = ('torque_bias', 'encoder_offset', 'viscous_friction', 'payload', 'integral_control')
+    found = diagnose(followed(), records, Options(effects=effects, workers=1))
+    assert {c.label for c in found.causes} == {f'integral_control@{joint}' for joint in JOINTS}
+    assert found.verdict == 'explained'
+
+
 def test_drives_that_all_add_up_are_identified_from_any_gains(robot, tmp_path):
     """What they hold is no torque that somebody measured: it may not lead the masses astray."""
     gains = dict(zip(JOINTS, (220.0, 260.0, 90.0), strict=True))
