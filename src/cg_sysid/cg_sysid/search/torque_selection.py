@@ -123,7 +123,7 @@ def select(
     if not torque_error.can(model):
         raise IdentificationError(
             f'model {model.name!r}: torques are compared for a robot of a URDF with an encoder at '
-            'every joint that moves'
+            'every joint that moves, and without integral_control'
         )
     judge = _Judge(train, held)
     search = _Search(judge, names, carry_out)
