@@ -51,7 +51,8 @@ from cg_control.trees.tree_files import TreeSelection
 from cg_description.model_file import write_atomically
 from cg_description.paths import model_path, models_directory
 from cg_description.reading import DocumentError, parse_yaml, read_text
-from cg_description.robot_description import driven_joints, parse
+from cg_description.robot_description import parse
+from cg_description.transmissions import couplings, driven_joints
 from cg_dynamics.errors import DynamicsError
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -324,6 +325,7 @@ def _read_urdf(path: Path) -> None:
     text = read_text(path)
     parse(text, path.name)
     driven_joints(text)
+    couplings(text)
 
 
 def _read_kept(path: Path) -> None:

@@ -94,6 +94,7 @@ def test_file_is_saved_whole(robot, tmp_path):
         (('parameters', 'c3', 'value'), 0.102, 'no real bodies.*condition 1'),
         (('mechanism',), 'unicycle', "unknown mechanism 'unicycle'; there are: compass_gait"),
         (('effects', 0, 'name'), 'magic', "unknown effect 'magic'; the library has: actuator_"),
+        (('effects', 0, 'name'), 'viqcous_friction', "did you mean 'viscous_friction'"),
         (('effects', 0, 'name'), 'm' * 100, "unknown effect 'm{40}…'; the library has: actuator_"),
         (('effects', 0, 'at'), 'knee', "acts at hip of a compass_gait, not at 'knee'"),
         (

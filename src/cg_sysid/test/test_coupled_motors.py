@@ -26,6 +26,7 @@ URDF = urdf().replace('</robot>', f'{LINKAGE}</robot>')
 SHARED = np.array([0.0, 1.0, 1.0])  # the knee's motor turns by the angle of the shank in space
 DRY = 0.4  # N m, of the knee's motor
 SECONDS = 6.0
+SOUGHT = 'coulomb_friction', 'viscous_friction', 'rotor_inertia', 'torque_bias'
 
 
 def rubs(time, q, v, torque):
@@ -79,7 +80,7 @@ def test_friction_of_a_motor_that_joints_share_is_told_from_theirs(recordings, t
     assert model.mechanism.driven == JOINTS
     records = [as_record(model, r, f'way_{k}', r.effort) for k, r in enumerate(recordings)]
     found = prepare(model, records)
-    (law,) = select(model, found[0::2], found[1::2]).laws
+    (law,) = select(model, found[0::2], found[1::2], SOUGHT).laws
     assert law.label == 'coulomb_friction@knee_motor'
     # A share of it is lost to smoothing, where the motor turns back.
     assert law.parameters['torque'][0] == pytest.approx(DRY, rel=0.05)
@@ -97,6 +98,6 @@ def test_torques_of_the_motors_say_the_same(recordings, tmp_path):
         records.append(read_bag(bag, mechanism=channels.interface(motors.mechanism)))
         assert records[-1].inputs.keys() == own.inputs.keys()
     found = prepare(motors, records)
-    (law,) = select(motors, found[0::2], found[1::2]).laws
+    (law,) = select(motors, found[0::2], found[1::2], SOUGHT).laws
     assert law.label == 'coulomb_friction@knee_motor'
     assert law.parameters['torque'][0] == pytest.approx(DRY, rel=0.05)

@@ -334,8 +334,10 @@ def test_gains_that_are_off_are_found(robot, tmp_path):
             lambda q, v: np.array([0.0, 0.35, 0.0]), ['torque_bias@thigh_joint'],
             marks=pytest.mark.evidence,
         ),
-        (lambda q, v: np.array([0.0, 0.0, -0.05 * v[2] * abs(v[2])]),
-         ['quadratic_friction@shank_joint']),
+        pytest.param(
+            lambda q, v: np.array([0.0, 0.0, -0.05 * v[2] * abs(v[2])]),
+            ['quadratic_friction@shank_joint'], marks=pytest.mark.evidence,
+        ),
     ],
     ids=['sound', 'bias', 'quadratic'],
 )  # fmt: skip

@@ -87,7 +87,7 @@ def test_a_fit_by_simulation_goes_on_from_there(believed):
     ('name', 'at', 'sizes'),
     [
         ('stribeck_friction', 'thigh_joint', {'torque': 0.3, 'stribeck_rate': 0.4}),
-        ('torque_constant', 'shank_joint', {'error': 0.3}),
+        pytest.param('torque_constant', 'shank_joint', {'error': 0.3}, marks=pytest.mark.evidence),
         pytest.param('torque_bias', 'hip_joint', {'bias': 0.4}, marks=pytest.mark.evidence),
         pytest.param('cogging_torque', 'thigh_joint', {'cosine': 0.3}, marks=pytest.mark.evidence),
         ('payload', 'shank', {'mass': 0.5, 'x': 0.05, 'y': 0.06, 'z': -0.2}),
@@ -132,7 +132,10 @@ def test_what_moves_by_itself_is_sought_where_a_simulation_misses_most(believed)
     assert ('backlash', last) in found.worth(candidates)
 
 
-@pytest.mark.parametrize('link', ['hip', 'thigh', 'shank'])
+EVIDENCE = [pytest.param(link, marks=pytest.mark.evidence) for link in ('hip', 'shank')]
+
+
+@pytest.mark.parametrize('link', ['thigh', *EVIDENCE])
 def test_a_push_is_worth_a_look_on_the_link_that_it_is_on(believed, link):
     true = believed.with_values(OFF)
     about = believed.mechanism.joints_to(link)
@@ -392,7 +395,11 @@ def test_what_nothing_drives_does_not_lose_its_weight():
     [
         ('joint_flexibility', {'stiffness': 0.05, 'rotor_inertia': 2e-5, 'damping': 3e-4}),
         ('backlash', {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}),
-        ('backlash', {'gap': 0.008, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}),
+        pytest.param(
+            'backlash',
+            {'gap': 0.008, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3},
+            marks=pytest.mark.evidence,
+        ),
     ],
 )
 def test_what_a_light_drive_hides_is_found_from_starts_of_its_size(name, hidden):

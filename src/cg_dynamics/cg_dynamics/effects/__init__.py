@@ -8,6 +8,7 @@ import importlib
 import pkgutil
 
 from cg_description.reading import shown
+from cg_description.schema import meant
 from cg_dynamics.effects.effect import Body, Effect
 from cg_dynamics.effects.unmodelled import UNMODELLED
 from cg_dynamics.errors import ModelError
@@ -39,5 +40,6 @@ def make_effect(name: str, mechanism: Mechanism, at: str | None = None) -> Effec
     """
     known = LIBRARY.get(name) or UNMODELLED.get(name)
     if known is None:
-        raise ModelError(f'unknown effect {shown(name)}; the library has: {", ".join(LIBRARY)}')
+        nearest = meant(name, LIBRARY) or f'; the library has: {", ".join(LIBRARY)}'
+        raise ModelError(f'unknown effect {shown(name)}{nearest}')
     return known(mechanism, at)
