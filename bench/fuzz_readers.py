@@ -217,7 +217,14 @@ URDF = """<?xml version="1.0"?>
   <joint name="elbow" type="continuous">
     <parent link="upper"/> <child link="fore"/> <mimic joint="shoulder" multiplier="2"/>
   </joint>
-  <transmission name="t"><joint name="shoulder"/></transmission>
+  <link name="hand"/>
+  <joint name="wrist" type="continuous"><parent link="fore"/><child link="hand"/></joint>
+  <transmission name="t"><type>transmission_interface/DifferentialTransmission</type>
+    <actuator name="a"><role>actuator1</role></actuator>
+    <actuator name="b"><role>actuator2</role></actuator>
+    <joint name="shoulder"><role>joint1</role></joint>
+    <joint name="wrist"><role>joint2</role><mechanicalReduction>-2</mechanicalReduction></joint>
+  </transmission>
 </robot>
 """
 SELECTION = json.dumps({'path': '/a/b/tree.npz', 'sha256': '0' * 64})
