@@ -189,8 +189,9 @@ def main() -> int:
     if options.write:
         options.write.write_text('\n'.join([
             '# Robots of which the URDF knows the bodies alone, with a secret', '',
-            'Command: `./cg exec python bench/robots_bare_secret.py`; this table of its rows: '
-            f'the same with `--table-only --write FILE`. Sources {shown[0]["version"]}; '
+            'Command: `./cg exec python bench/robots_bare_secret.py '
+            f'{" ".join(map(repr, options.patterns))} --limit {options.limit:g}`; this table of '
+            f'its rows: the same with `--table-only --write FILE`. Sources {shown[0]["version"]}; '
             f'{len(shown)} of {len(programme())} cases run.',
             'What is right is written at the head of the bench, and was settled before any case '
             'was run.', '', *lines, '',

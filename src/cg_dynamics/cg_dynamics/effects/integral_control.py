@@ -7,7 +7,7 @@ HOLDING = 4.0  # start torques that it may hold as a record begins: most of them
 
 
 class IntegralControl(Effect):
-    """tau = ff + held, d held/dt = gain (q_c - q), beside position_control.
+    """tau + held, d held/dt = gain (q_c - q), with tau of position_control.
 
     What the drive holds as a record begins nobody wrote down: it is each record's own. Limits of
     the sum (anti-windup) are not part of the law.
@@ -16,8 +16,8 @@ class IntegralControl(Effect):
     name = 'integral_control'
     place = 'command'
     summary = (
-        'The drive that follows positions adds up their errors: tau = ff + held, '
-        'd held/dt = gain (q_c - q).'
+        'A drive that follows positions adds up their errors too: held comes on top of the torque '
+        'of position_control, d held/dt = gain (q_c - q).'
     )
     parameters = (
         Parameter(
