@@ -115,11 +115,11 @@ def test_lock_step_balances_and_repeats_to_the_bit(loop):
     ('victim', 'by'),
     [
         ('observer', signal.SIGKILL),
-        ('balance', signal.SIGKILL),
+        pytest.param('balance', signal.SIGKILL, marks=pytest.mark.evidence),
         ('safety_gate', signal.SIGKILL),
-        ('observer', signal.SIGSTOP),
+        pytest.param('observer', signal.SIGSTOP, marks=pytest.mark.evidence),
         ('balance', signal.SIGSTOP),
-        ('safety_gate', signal.SIGSTOP),
+        pytest.param('safety_gate', signal.SIGSTOP, marks=pytest.mark.evidence),
     ],
     ids=[
         'observer dies',
@@ -171,6 +171,7 @@ def changes(run, count, samples=15):
     return run.reports[1:before], run.reports[before:]
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_two_hundred_changes_of_a_weight_do_not_fell_the_robot(loop):
     run = loop(mode='lockstep', stance='inner', lean=0.03)

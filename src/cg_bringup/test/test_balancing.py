@@ -41,7 +41,7 @@ def test_holds_the_robot_from_a_lean_of_0_06_rad(stance):
         assert np.abs(motion.lean[-500:]).max() < 0.03
 
 
-@pytest.mark.parametrize('stance', ['inner', 'outer'])
+@pytest.mark.parametrize('stance', ['inner', pytest.param('outer', marks=pytest.mark.evidence)])
 def test_seeded_starts_inside_the_stated_basin_succeed(stance):
     """Ten of the hundred of bench/balance.py."""
     rng = np.random.default_rng(7)

@@ -72,6 +72,7 @@ def passed_in_turns(folder, found):
     return passed, [name for name in NAMES if name not in passed]
 
 
+@pytest.mark.evidence
 def test_a_sound_robot_passes(robot, tmp_path):
     devices, person = robot
     code, said, found = walked(tmp_path / 'out')

@@ -24,7 +24,9 @@ def test_of_something_else(k):
 """
 
 
-@pytest.mark.parametrize(('excused', 'code'), [(0, 0), (1, 0), (3, 1)])
+@pytest.mark.parametrize(('excused', 'code'), [
+    pytest.param(0, 0, marks=pytest.mark.evidence), (1, 0), (3, 1),
+])  # fmt: skip
 def test_a_run_that_excuses_most_tests_with_deadlines_fails(tmp_path, excused, code):
     shutil.copy(CONFTEST, tmp_path)
     (tmp_path / 'pyproject.toml').write_text(

@@ -42,8 +42,11 @@ FRICTIONS = (
     'load_dependent_friction', 'presliding_friction',
 )  # fmt: skip
 HIDDEN = (
-    ('actuator_lag', 12, None, SWINGS[::2], SHORT),
-    ('stribeck_friction', 17, ('stribeck_friction', *FRICTIONS), SWINGS, DURATION),
+    pytest.param('actuator_lag', 12, None, SWINGS[::2], SHORT, marks=pytest.mark.evidence),
+    pytest.param(
+        'stribeck_friction', 17, ('stribeck_friction', *FRICTIONS), SWINGS, DURATION,
+        marks=pytest.mark.evidence,
+    ),
     (
         'backlash', 20,
         ('backlash', 'joint_flexibility', 'actuator_delay', 'encoder_eccentricity'), SWINGS, SHORT,
@@ -120,8 +123,8 @@ def test_nothing_hidden_is_consistent(seed, tmp_path):
     [
         pytest.param('external_push', SPRINGS, DURATION, marks=pytest.mark.evidence),
         ('friction_drift', SWINGS, SHORT),
-        ('imu_drift', SWINGS, SHORT),
-        ('tether_force', SPRINGS, SHORT),
+        pytest.param('imu_drift', SWINGS, SHORT, marks=pytest.mark.evidence),
+        pytest.param('tether_force', SPRINGS, SHORT, marks=pytest.mark.evidence),
     ],
 )
 def test_the_command_line_tells_of_every_kind_of_effect(effect, programme, duration, tmp_path):

@@ -26,7 +26,7 @@ from cg_sysid.diagnosis.result import Options
 from cg_sysid.records.bags import write_bag
 from cg_sysid.search.ranking import effect_name
 
-pytestmark = pytest.mark.xdist_group('learning_from_walks')
+pytestmark = [pytest.mark.evidence, pytest.mark.xdist_group('learning_from_walks')]
 
 MODEL_FILE = model_path('compass_gait_mit')
 T = 0.002

@@ -105,7 +105,7 @@ def torqued(robot, person):
     return report
 
 
-ALWAYS = 'drive_fault', 'imu_unplugged', 'drive_killed', 'balance_killed'
+ALWAYS = 'imu_unplugged', 'balance_killed'
 
 
 @pytest.mark.parametrize('fault', [

@@ -121,7 +121,10 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize('hidden', HIDDEN)
+@pytest.mark.parametrize('hidden', [
+    hidden if hidden == 'a payload' else pytest.param(hidden, marks=pytest.mark.evidence)
+    for hidden in HIDDEN
+])  # fmt: skip
 def test_it_walks_on_with_what_nobody_told_it(walker, hidden):
     controller = walker(speed=0.3, steps=6)
     done = run(controller, 19.0, **HIDDEN[hidden])

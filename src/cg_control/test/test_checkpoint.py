@@ -238,7 +238,10 @@ def test_growth_that_is_killed_again_and_again_ends_as_in_one_go(robot, in_one_g
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [
+    pytest.param(signal.SIGINT, marks=pytest.mark.evidence),
+    signal.SIGTERM,
+])  # fmt: skip
 def test_a_signal_ends_growth_with_a_checkpoint(robot, in_one_go, tmp_path, number):
     out, part = tmp_path / 'tree.npz', tmp_path / 'kept'
     words = ['--samples', str(SAMPLES), '--seed', str(SEED), '--workers', '1', '--out', str(out),

@@ -30,7 +30,13 @@ def test_upright_is_home_on_the_legs_that_are_asked_for(robot):
 
 
 @needs_compiler
-@pytest.mark.parametrize(('goal', 'leg'), [('inner', 0), ('outer', 1)])
+@pytest.mark.parametrize(
+    ('goal', 'leg'),
+    [
+        ('inner', 0),
+        pytest.param('outer', 1, marks=pytest.mark.evidence),
+    ],
+)
 def test_a_tree_to_one_leg_is_grown_and_written(robot, tmp_path, capsys, monkeypatch, goal, leg):
     make_small(monkeypatch)
     path = tmp_path / 'tree.npz'

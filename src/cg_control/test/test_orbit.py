@@ -222,6 +222,7 @@ def test_passive_gait_has_a_multiplier_of_one_and_those_of_its_return_map(robot)
     )
 
 
+@pytest.mark.evidence
 def test_library_reaches_as_far_as_the_torque_does(walker):
     library = orbit_library(
         walker, 0.3, torque_limit=8.0, begin=(0.3,), spacing=0.1, resolution=0.05,

@@ -9,6 +9,7 @@ from cg_control.trees.tree import Tree
 from cg_control.trees.tree_files import tree_path
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_a_tree_takes_in_the_first_champions_of_one_to_upright(robot, tmp_path, capsys):
     path, base = tmp_path / 'walk.npz', tree_path('compass_gait_mit')

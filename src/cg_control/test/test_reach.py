@@ -73,6 +73,7 @@ def test_one_state_is_judged_as_among_many(screen):
             assert getattr(alone, name)[0] == pytest.approx(getattr(together, name)[i], rel=1e-9)
 
 
+@pytest.mark.evidence
 def test_no_plan_is_found_where_the_screen_says_no(plant, screen):
     """Twelve states of the box, planned for by the full search: a no is a no, a yes often one."""
     rng, agreed, tried = np.random.default_rng(46), 0, 0

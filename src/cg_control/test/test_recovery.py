@@ -474,6 +474,7 @@ def test_a_way_that_fails_is_left_after_patience(make, promised):
     assert modes[-1] == OUTSIDE
 
 
+@pytest.mark.evidence
 @COMPILED
 def test_it_brings_home_what_a_preview_promises(make, robot, promised):
     leg, x, _ = (rows[:20] for rows in promised)

@@ -99,6 +99,7 @@ class Plant:
                     f'got shape {motion.shape}'
                 )
         self._input_delay, self._output_delays, _ = self._compiled.delays(self._p)
+        self._distinct_delays = set(self._output_delays) - {0.0}
         self._torques = len(model.mechanism.inputs)
         names = self._compiled.input_names
         told = [n for joint in model.mechanism.joints for n in model.mechanism.told(joint)]
@@ -277,11 +278,12 @@ class Plant:
     def _clean_outputs(self) -> np.ndarray:
         held, names = self._latches[-1][1], self._compiled.input_names
         u = stamped(held, names, self._clock)
-        now = np.asarray(self._compiled.h(self._x, u, self._p)).ravel()
-        for j in np.flatnonzero(self._output_delays):
-            late = self.time - self._output_delays[j]
+        now = self._compiled.read(self._x, u, self._p)
+        for delay in self._distinct_delays:
+            late = self.time - delay
             u = stamped(held, names, late + self._clock - self.time)
-            now[j] = np.asarray(self._compiled.h(self._at(late), u, self._p))[j, 0]
+            then = self._compiled.read(self._at(late), u, self._p)
+            now = np.where(self._output_delays == delay, then, now)
         return now
 
     def _at(self, t: float) -> np.ndarray:

@@ -104,7 +104,7 @@ class Phase:
 
     def read(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """What the sensors would report, before any delay, shape (ny,)."""
-        return np.asarray(self.compiled.h(x, u, self.p)).ravel()
+        return self.compiled.read(x, u, self.p)
 
 
 class StampedEstimator(ABC):

@@ -54,6 +54,7 @@ def hidden(request, model_file):
     return request.param, nominal, records
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_each_is_told_from_the_other(hidden):
     effect, nominal, records = hidden

@@ -124,7 +124,7 @@ def test_a_rotor_that_runs_away_is_no_start(stiff):
     assert bad.deviance == np.inf
 
 
-@pytest.mark.parametrize('gap', [0.008, 0.02])
+@pytest.mark.parametrize('gap', [pytest.param(0.008, marks=pytest.mark.evidence), 0.02])
 def test_play_is_found_with_no_simulation_of_the_robot(gap):
     hidden = {'gap': gap, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}
     believed = finger()

@@ -60,7 +60,7 @@ def test_grease_that_warms_over_a_session_is_seen(nominal):
     }
 
 
-@pytest.mark.parametrize('goes_on', [True, False])
+@pytest.mark.parametrize('goes_on', [True, pytest.param(False, marks=pytest.mark.evidence)])
 def test_grease_that_goes_on_warming_is_told_from_grease_that_warms_anew(nominal, goes_on):
     excess, time_constant, every = 0.8, 9.0, 8.0
     begins = every * np.arange(4)
@@ -89,6 +89,7 @@ def test_grease_that_goes_on_warming_is_told_from_grease_that_warms_anew(nominal
         assert abs(value - true) < 4 * sigma < 0.4 * true
 
 
+@pytest.mark.evidence
 def test_a_robot_set_down_anew_each_time_stands_on_another_slope(nominal):
     slopes = [0.01, -0.012, 0.02, -0.005]
     moved = [nominal.with_effect('ground_slope', angle=slope) for slope in slopes]

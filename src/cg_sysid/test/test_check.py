@@ -524,6 +524,7 @@ def test_an_encoder_between_tied_legs_may_rest():
     assert report.verdict == 'good'
 
 
+@pytest.mark.evidence
 def test_feedback_is_seen_in_most_cases():
     def with_feedback(raw):
         angle = raw.topics['/hip_encoder'].values['hip_angle']
@@ -550,6 +551,7 @@ def test_the_region_of_use_is_compared_with_the_data():
     assert [f.where for f in report.of('coverage_unknown')] == ['knee']
 
 
+@pytest.mark.evidence
 def test_nothing_that_reading_refuses_is_called_usable():
     raw = synthesise(Synthesis(), 0)
     for fault in (change for change, *_ in FAULTS.values()):

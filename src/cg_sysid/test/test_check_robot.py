@@ -79,7 +79,13 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize('effect', ['', *HIDDEN])
+ALWAYS = '', 'sensor_delay', 'external_push', 'joint_flexibility', 'friction_drift'
+
+
+@pytest.mark.parametrize('effect', [
+    effect if effect in ALWAYS else pytest.param(effect, marks=pytest.mark.evidence)
+    for effect in ('', *HIDDEN)
+])  # fmt: skip
 def test_physics_is_no_fault(effect):
     machine = machine_of(effect, **HIDDEN.get(effect, {}))
     for seed, name in ((20, 'spring_stabilised_inner'), (21, 'swing_outer_fixed')):

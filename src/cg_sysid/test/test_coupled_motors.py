@@ -86,6 +86,7 @@ def test_friction_of_a_motor_that_joints_share_is_told_from_theirs(recordings, t
     assert law.parameters['torque'][0] == pytest.approx(DRY, rel=0.05)
 
 
+@pytest.mark.evidence
 def test_torques_of_the_motors_say_the_same(recordings, tmp_path):
     """Each motor's own: that of the knee acts on both joints."""
     motors = written(tmp_path, '--driven', 'hip_joint,thigh_joint,knee_motor')

@@ -83,9 +83,9 @@ def nominal(model_file):
     ('hidden', 'name', 'listed'),
     [
         (TenTightPlaces, 'position_dependent_friction', ('asymmetric_friction',)),
-        (DeadZone, 'torque_dead_zone', ('torque_saturation', 'load_dependent_friction')),
-        (ViscoelasticHip, 'joint_creep', ('presliding_friction', 'torque_constant')),
         *(pytest.param(*case, marks=pytest.mark.evidence) for case in (
+            (DeadZone, 'torque_dead_zone', ('torque_saturation', 'load_dependent_friction')),
+            (ViscoelasticHip, 'joint_creep', ('presliding_friction', 'torque_constant')),
             (Triangle, 'cogging_torque', ('torque_bias',)),
             (ElevenTightPlaces, 'position_dependent_friction', ('torque_bias', 'cogging_torque')),
             (StraightDrift, 'friction_drift', ('stribeck_friction',)),

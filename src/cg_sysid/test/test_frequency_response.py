@@ -83,7 +83,11 @@ def records():
 
 @pytest.mark.parametrize(
     ('name', 'effect'),
-    [('mit', ''), ('flexible', 'joint_flexibility'), ('imu_mount', 'imu_mount_flexibility')],
+    [
+        ('mit', ''),
+        ('flexible', 'joint_flexibility'),
+        pytest.param('imu_mount', 'imu_mount_flexibility', marks=pytest.mark.evidence),
+    ],
 )
 def test_the_seat_of_a_resonance_is_told_by_the_path_that_has_it(records, name, effect):
     _, found = analyse(records[name])

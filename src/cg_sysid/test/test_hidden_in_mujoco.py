@@ -89,7 +89,7 @@ NEAREST = (
     ('effect', 'candidates'),
     [
         ('none', None),
-        ('quadratic_friction', NEAREST),
+        pytest.param('quadratic_friction', NEAREST, marks=pytest.mark.evidence),
         pytest.param('gyro_bias', NEAREST, marks=pytest.mark.evidence),
         pytest.param('quadratic_friction', None, marks=pytest.mark.evidence),
         pytest.param('gyro_bias', None, marks=pytest.mark.evidence),

@@ -90,7 +90,7 @@ SLIPPERY = (('foot_slip', 'friction', 0.35),)
     ('ground', 'effect', 'value'),
     [
         (SOFTER, 'impact_restitution', 0.1),
-        (SLIPPERY, 'foot_slip', 0.35),
+        pytest.param(SLIPPERY, 'foot_slip', 0.35, marks=pytest.mark.evidence),
     ],
 )
 def test_the_law_comes_back_inside_its_interval(ground, effect, value):
@@ -166,6 +166,7 @@ def test_plastic_landings_are_not_accused():
     assert found.judged == len(cut.landings)
 
 
+@pytest.mark.evidence
 def test_a_payload_that_nobody_found_is_no_bounce_and_no_slide():
     """The phases' numbers take most of it up; what is left after landings is not accused."""
     records, _ = recorded((('payload', 'mass', 1.2),), (), (0, 1), 2.0)
@@ -186,6 +187,7 @@ def test_too_few_landings_are_not_judged():
 LUMPS = (('c1', 1.12), ('c2', 0.9), ('c4', 0.88), ('c5', 1.1))
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 @pytest.mark.parametrize(
     'ground',
@@ -265,6 +267,7 @@ def in_mujoco(values, seed, friction):
                   'compass_gait', Setup(stance=stance))  # fmt: skip
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 @pytest.mark.parametrize('friction', [pytest.param(2.0, marks=pytest.mark.evidence), 0.35])
 def test_the_ground_of_another_engine_is_named(friction):

@@ -167,7 +167,10 @@ def test_legs_that_pass_and_scuff_are_no_touchdown(nominal):
 # --- phases ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('ground', GROUNDS)
+@pytest.mark.parametrize('ground', [
+    pytest.param(ground, marks=pytest.mark.evidence) if ground != 'impact_restitution' else ground
+    for ground in GROUNDS
+])  # fmt: skip
 def test_phases_hold_no_sample_of_a_bounce_or_a_slide(nominal, ground):
     machine = on(nominal, ground)
     walks = [walking(machine, seed=k, stance=s) for k, s in ((0, 'inner'), (1, 'outer'))]

@@ -352,6 +352,7 @@ def test_what_a_robot_lacks_that_follows_positions_is_named(robot, tmp_path, law
     assert found.verdict == ('explained' if expected else 'consistent')
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_the_integral_part_of_a_drive_is_named(robot, tmp_path):
     """It holds a torque already as the recordings begin, which nobody told."""

@@ -71,7 +71,7 @@ def records_of(nominal, shape, width, pushed):
 
 
 @pytest.mark.parametrize(('shape', 'width'), [
-    ('rectangle', 0.02),
+    pytest.param('rectangle', 0.02, marks=pytest.mark.evidence),
     ('half_sine', 0.12),
     pytest.param('rectangle', 0.12, marks=pytest.mark.evidence),
     pytest.param('half_sine', 0.02, marks=pytest.mark.evidence),

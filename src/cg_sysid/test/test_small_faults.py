@@ -81,6 +81,7 @@ def test_small_faults_alone_are_consistent(nominal):
     assert identified == pytest.approx(0.001, rel=0.05)  # a quarter of a sample
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_hard_friction_is_consistent(nominal):
     """Friction that turns fifty times as fast as the model was drawn."""
@@ -142,6 +143,7 @@ def test_friction_that_gives_way_a_little_is_consistent(nominal):
     assert any(f.startswith('presliding_friction.deflection = ') for f in found.findings)
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_friction_that_gives_way_a_little_is_no_cause_and_hides_none(nominal):
     """Bristles as sound machines have them, on top of Stribeck friction that nobody stated."""
@@ -211,7 +213,10 @@ def test_small_faults_that_leave_no_white_noise_have_imitated_a_cause(nominal):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('coefficient', 'told'),
-    [(0.006, 'where no small fault does'), (0.008, 'a small cause may hide behind them')],
+    [
+        pytest.param(0.006, 'where no small fault does', marks=pytest.mark.evidence),
+        (0.008, 'a small cause may hide behind them'),
+    ],
 )
 def test_what_hides_behind_small_faults_and_is_small_itself_is_no_cause(
     nominal, coefficient, told
@@ -243,6 +248,7 @@ def test_a_tether_and_two_springs_that_conspire_are_not_told_apart(nominal):
     assert found.causes[0].proposals[0].evidence < settings.SELECTION.margin
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_what_small_faults_take_a_part_of_is_not_small_itself(nominal):
     """Of a tether two springs may be any part that their bounds allow: its force is uncertain."""
@@ -270,10 +276,9 @@ def test_springs_that_do_not_conspire_are_no_tether(nominal):
 @pytest.mark.parametrize(
     ('effect', 'values', 'shape', 'rival'),
     [
-        ('stribeck_friction', {'torque': 0.9, 'stribeck_rate': 0.3}, ('exponent', 1.0),
-         'quadratic_friction'),
-        pytest.param('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant',
-                     marks=pytest.mark.evidence),
+        pytest.param('stribeck_friction', {'torque': 0.9, 'stribeck_rate': 0.3}, ('exponent', 1.0),
+                     'quadratic_friction', marks=pytest.mark.evidence),
+        ('torque_saturation', {'limit': 6.5}, ('roundness', 1.5), 'torque_constant'),
         pytest.param('position_dependent_friction', {'torque': 3.5, 'tightest': 0.4},
                      ('cycles', 2.0), 'asymmetric_friction', marks=pytest.mark.evidence),
     ],

@@ -164,7 +164,11 @@ def _slow_sweep(machine, k):
     ('effect', 'values'),
     [
         ('joint_flexibility', {'stiffness': 115.0, 'rotor_inertia': 0.09, 'damping': 0.7}),
-        ('joint_flexibility', {'stiffness': 300.0, 'rotor_inertia': 0.15, 'damping': 0.4}),
+        pytest.param(
+            'joint_flexibility',
+            {'stiffness': 300.0, 'rotor_inertia': 0.15, 'damping': 0.4},
+            marks=pytest.mark.evidence,
+        ),
         pytest.param(
             'backlash', {'gap': 0.007, 'rotor_inertia': 0.14}, marks=pytest.mark.evidence
         ),
@@ -183,7 +187,9 @@ def test_found_where_the_first_seconds_mislead(model_file, effect, values):
     assert outcome.held.normalised_error < 1.2
 
 
-@pytest.mark.parametrize('start', [60.0, 600.0, 4000.0])  # N m/rad
+@pytest.mark.parametrize(
+    'start', [pytest.param(60.0, marks=pytest.mark.evidence), 600.0, 4000.0]
+)  # N m/rad
 def test_a_curved_valley_is_followed_to_its_end(model_file, start):
     # Stiffness, inertias and damping make up for each other: only their ratios are seen well.
     nominal = Model.load(model_file)

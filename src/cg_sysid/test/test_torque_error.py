@@ -90,7 +90,12 @@ def test_a_fit_by_simulation_goes_on_from_there(believed):
         pytest.param('torque_constant', 'shank_joint', {'error': 0.3}, marks=pytest.mark.evidence),
         pytest.param('torque_bias', 'hip_joint', {'bias': 0.4}, marks=pytest.mark.evidence),
         pytest.param('cogging_torque', 'thigh_joint', {'cosine': 0.3}, marks=pytest.mark.evidence),
-        ('payload', 'shank', {'mass': 0.5, 'x': 0.05, 'y': 0.06, 'z': -0.2}),
+        pytest.param(
+            'payload',
+            'shank',
+            {'mass': 0.5, 'x': 0.05, 'y': 0.06, 'z': -0.2},
+            marks=pytest.mark.evidence,
+        ),
         pytest.param('rotor_inertia', 'hip_joint', {'inertia': 0.08}, marks=pytest.mark.evidence),
         pytest.param(
             'quadratic_friction', 'shank_joint', {'coefficient': 0.1}, marks=pytest.mark.evidence
@@ -98,7 +103,7 @@ def test_a_fit_by_simulation_goes_on_from_there(believed):
         pytest.param(
             'encoder_offset', 'thigh_joint_position', {'offset': 0.1}, marks=pytest.mark.evidence
         ),
-        ('sensor_delay', None, {'delay': 0.012}),
+        pytest.param('sensor_delay', None, {'delay': 0.012}, marks=pytest.mark.evidence),
         pytest.param('actuator_delay', None, {'delay': 0.02}, marks=pytest.mark.evidence),
     ],
 )
@@ -115,6 +120,7 @@ def test_the_cause_is_worth_a_look(believed, name, at, sizes):
     assert len(kept) < len(candidates) / 2
 
 
+@pytest.mark.evidence
 def test_what_moves_by_itself_is_sought_where_a_simulation_misses_most(believed):
     # Said to be missed most is the joint that the torques suspect least.
     train = data(believed.with_values(OFF), believed)
@@ -366,6 +372,7 @@ def ride(machine, k):
     )  # fmt: skip
 
 
+@pytest.mark.evidence
 def test_a_fit_with_play_sets_out_from_torques():
     believed = Model.from_text(CART_POLE)
     machine = believed.with_values({'cart_mass': 1.02}).with_effect('backlash', **PLAY)
@@ -394,7 +401,11 @@ def test_what_nothing_drives_does_not_lose_its_weight():
     ('name', 'hidden'),
     [
         ('joint_flexibility', {'stiffness': 0.05, 'rotor_inertia': 2e-5, 'damping': 3e-4}),
-        ('backlash', {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3}),
+        pytest.param(
+            'backlash',
+            {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3},
+            marks=pytest.mark.evidence,
+        ),
         pytest.param(
             'backlash',
             {'gap': 0.008, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3},
@@ -436,10 +447,11 @@ def test_a_start_whose_sensitivities_run_away_stays_where_it_is(believed, monkey
     ('name', 'hidden', 'ruled_out'),
     [
         ('coulomb_friction', {'torque': 1.1e-3}, True),
-        (
+        pytest.param(
             'backlash',
             {'gap': 0.02, 'rotor_inertia': 2e-5, 'stiffness': 3.0, 'damping': 5e-3},
             False,
+            marks=pytest.mark.evidence,
         ),
     ],
 )

@@ -73,6 +73,7 @@ def test_two_laws_of_two_joints_are_taken_up_with_their_sizes(believed):
     assert {e.label for e in found.model.effects} > set(sizes)
 
 
+@pytest.mark.evidence
 def test_what_all_joints_lack_is_taken_up_at_once(believed, monkeypatch):
     """Dry friction and rotors, of which the file says nothing; each joint hides the others'."""
     bare, hidden = believed, []
@@ -105,7 +106,7 @@ def test_of_laws_that_leave_the_same_the_simplest_is_taken_up(believed):
     assert law.parameters['torque'][0] == pytest.approx(0.5, rel=0.05)
 
 
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize('seed', [1, pytest.param(2, marks=pytest.mark.evidence)])
 def test_a_sound_arm_has_none(believed, seed):
     records = [recorded(machine(believed), SECONDS, 10 * seed + k) for k in range(4)]
     data_sets = prepare(believed, records)
@@ -121,6 +122,7 @@ def test_only_those_asked_for_are_taken_up(believed):
     assert law.label == 'cogging_torque@hip_joint'
 
 
+@pytest.mark.evidence
 def test_recordings_with_different_joints_locked_go_together(believed):
     setups = (SHANK, SHANK, LEG, LEG)
     true = machine(believed, STRIBECK)

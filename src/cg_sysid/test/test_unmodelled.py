@@ -30,7 +30,7 @@ def test_none_of_them_is_in_the_library():
 # One law of each kind in every run; bench/evidence.py has the others.
 OTHERS = (
     'hidden_torsion_spring', 'hidden_fading', 'hidden_stop',
-    'hidden_imu_error', 'hidden_gravity_in_gyro', 'hidden_detent',
+    'hidden_imu_error', 'hidden_gravity_in_gyro', 'hidden_detent', 'hidden_gyro_error',
 )  # fmt: skip
 
 
@@ -98,6 +98,7 @@ def test_described_where_a_sensor_was_not_recorded(nominal):
     assert (answer.unmodelled.where, answer.unmodelled.effect.follows) == ('joint', 'angle:hip')
 
 
+@pytest.mark.evidence
 @pytest.mark.slow
 def test_short_records_are_not_explained_by_pushes_of_their_own(nominal):
     # Two values more for each half second match it better whatever is wrong, held out or not.

@@ -101,6 +101,7 @@ class CompiledModel:
         self.h = ca.Function('h', [e.x, e.u, e.p], [e.outputs], ['x', 'u', 'p'], ['y'])
         self._stiffness = ca.Function('stiffness', [e.x, e.u, e.p], e.rates_by(e.x))
         self.has_delays = not delays.is_zero()
+        self._instant, self._on_time = np.zeros(1), np.zeros(self.ny)
         self._c: Any = (NativeRollout if native else InterpretedRollout)(equations, free)
 
     def delays(self, p: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -227,6 +228,13 @@ class CompiledModel:
         states = _shaped('states', states, (len(time), self.nx))
         return self._outputs(self._late_rows(time, u, p, 1.0), states, p)
 
+    def read(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """What the sensors report in one state, before any delay, shape (ny,)."""
+        self._one_row(x, u, p)
+        y = np.empty(self.ny)
+        self._c.cgm_outputs(1, self._instant, u[None], p, x[None], self._on_time, y[None])
+        return y
+
     def readings(
         self,
         time: np.ndarray,
@@ -264,12 +272,16 @@ class CompiledModel:
 
     def advance(self, x: np.ndarray, u: np.ndarray, p: np.ndarray, step: float, n: int) -> None:
         """Integrate x in place over n Runge-Kutta steps of `step` s with inputs held."""
+        self._one_row(x, u, p)
+        self._c.cgm_advance(x, u, p, step, n)
+
+    def _one_row(self, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> None:
+        # C reads as many numbers as the model has, whatever it is handed.
         if x.shape != (self.nx,) or u.shape != (self.nu,) or p.shape != (self.np,):
             raise ValueError(
                 f'x, u, p have shapes {x.shape}, {u.shape}, {p.shape}; '
                 f'expected ({self.nx},), ({self.nu},), ({self.np},)'
             )
-        self._c.cgm_advance(x, u, p, step, n)
 
     def judge(
         self,
@@ -317,7 +329,6 @@ class CompiledModel:
         return judged.normal(s0, column, keep)
 
     def _checked(self, time, u, x0, p) -> tuple[np.ndarray, ...]:
-        # C reads as many numbers as the model has, whatever it is handed.
         time = _array(time)
         return (
             time,

@@ -124,24 +124,54 @@ def _fitted(
     square = contrasts(time, values - values[0], width)[use] ** 2
     speed = rate[inner][use] ** 2
     part = np.arange(len(square)) * PARTS // len(square)
-    order = np.argsort(speed, kind='stable')
-    classes = np.empty(len(speed), dtype=int)
-    classes[order] = np.arange(len(speed)) * CLASSES // len(speed)
-    whole = _slope(square, speed, classes)
-    without = [_slope(square[part != k], speed[part != k], classes[part != k])[1]
-               for k in range(PARTS)]  # fmt: skip
-    spread = float(np.sum((np.array(without) - np.mean(without)) ** 2))
-    error = float(np.sqrt((PARTS - 1) / PARTS * spread))
-    fast = float(np.median(speed[classes == CLASSES - 1]))
-    rest = max(whole[0], ROUNDING * resolution(values) ** 2)
-    return _Line(rest, rest + whole[1] * fast, whole[1], max(error, 1e-300))
+    classes = _of_like(speed)
+    levels, rates = (_medians(each, classes, part) for each in (square, speed))
+    *without, whole = (_slope(*each) for each in zip(levels / MEDIAN, rates, strict=True))
+    slopes = np.array([slope for _, slope in without])
+    error = float(np.sqrt((PARTS - 1) / PARTS * np.sum((slopes - slopes.mean()) ** 2)))
+    rest, slope = max(whole[0], ROUNDING * resolution(values) ** 2), whole[1]
+    return _Line(rest, rest + slope * float(rates[-1, -1]), slope, max(error, 1e-300))
 
 
-def _slope(square: np.ndarray, speed: np.ndarray, classes: np.ndarray) -> tuple[float, float]:
-    """Intercept and slope of the variance over the squared rate."""
-    present = [k for k in range(CLASSES) if np.any(classes == k)]
-    level = np.array([np.median(square[classes == k]) for k in present]) / MEDIAN
-    at = np.array([np.median(speed[classes == k]) for k in present])
+def _of_like(speed: np.ndarray) -> np.ndarray:
+    """Samples by classes of like rate, as many in each: indices, -1 where a row is shorter."""
+    rows = np.arange(len(speed)) * CLASSES // len(speed)
+    sizes = np.bincount(rows, minlength=CLASSES)
+    table = np.full((CLASSES, sizes.max()), -1)
+    table[np.arange(sizes.max()) < sizes[:, None]] = np.argsort(speed, kind='stable')
+    return table
+
+
+def _medians(values: np.ndarray, classes: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Medians of each class, without each part of the record in turn, and of the whole at last.
+
+    Of each class the values are sorted once: without a part, those in the middle are others.
+
+    Args:
+        values: Shape (M,).
+        classes: Indices of samples, -1 for none, shape (CLASSES, K).
+        part: Of each sample, 0 to PARTS - 1, shape (M,).
+
+    Returns:
+        Shape (PARTS + 1, CLASSES); NaN where no sample is left.
+    """
+    rows = np.arange(len(classes))
+    ordered = np.where(classes >= 0, values[classes], np.inf)
+    order = np.argsort(ordered, axis=1)
+    ordered = np.take_along_axis(ordered, order, axis=1)
+    parts = np.take_along_axis(np.where(classes >= 0, part[classes], PARTS), order, axis=1)
+    kept = (parts != np.arange(PARTS + 1)[:, None, None]) & (parts < PARTS)
+    counted = np.cumsum(kept, axis=2)
+    count = counted[:, :, -1:]
+    lower, upper = (np.argmax(counted > rank // 2, axis=2) for rank in (count - 1, count))
+    middle = (ordered[rows, lower] + ordered[rows, upper]) / 2.0
+    return np.where(count[:, :, 0] > 0, middle, np.nan)
+
+
+def _slope(level: np.ndarray, at: np.ndarray) -> tuple[float, float]:
+    """Intercept and slope of the variance over the squared rate, of the classes with samples."""
+    present = np.isfinite(level)
+    level, at = level[present], at[present]
     # A variance is known to a share of itself.
     weight = 1.0 / np.maximum(level, 1e-3 * level.max() + 1e-300)
     design = np.column_stack([np.ones(len(at)), at]) * weight[:, None]
