@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from hanging_arm import nominal, recorded
+from slide import CART_POLE, ride
 
 from cg_dynamics.model import Model
 from cg_dynamics.rig import Setup
@@ -95,6 +96,29 @@ def test_what_all_joints_lack_is_taken_up_at_once(believed, monkeypatch):
     for label, size in true.items():
         assert sizes[label] == pytest.approx(size, rel=0.1), label
     assert len(looks) == 3  # one for each kind, and one that finds nothing more
+
+
+def test_a_stribeck_curve_is_told_where_dry_friction_seems_to_stay():
+    """All that fades grows again as viscous friction does."""
+    dry, viscous, fading, rate = 1.0, 3.0, 3.0, 0.3
+    # Of a slide whose file knows no friction.
+    bare = Model.from_text(CART_POLE).without_effect('viscous_friction@slide')
+    true = bare.with_effect('coulomb_friction', 'slide', torque=dry)
+    true = true.with_effect('viscous_friction', 'slide', coefficient=viscous)
+    true = true.with_effect('stribeck_friction', 'slide', torque=fading, stribeck_rate=rate)
+    data_sets = prepare(bare, [ride(true, k) for k in range(4)])
+    shapes = ('coulomb', 'viscous', 'quadratic', 'stribeck')
+    asked_for = [f'{shape}_friction@slide' for shape in shapes]
+    found = select(bare, data_sets[0::2], data_sets[1::2], asked_for)
+    sizes = {law.label: [value for value, _, _ in law.parameters.values()] for law in found.laws}
+    # Biased by smoothing, as all torque fits are.
+    assert sizes == {
+        'coulomb_friction@slide': pytest.approx([dry], rel=0.05),
+        'viscous_friction@slide': pytest.approx([viscous], rel=0.05),
+        'stribeck_friction@slide': pytest.approx([fading, rate], rel=0.05),
+    }
+    alone = select(bare, data_sets[0::2], data_sets[1::2], asked_for[:3])
+    assert 'stribeck_friction@slide' not in {law.label for law in alone.laws}
 
 
 def test_of_laws_that_leave_the_same_the_simplest_is_taken_up(believed):

@@ -3,7 +3,9 @@
     torque fit of the numbers -> score tests of all effects (torque_screening.py)
       -> torque fits of the best -> that which gains most is taken up, if records held out gain too
       -> friction and rotors at all other joints as well, if they gain by that
-      -> again on top of these, until none does -> each asked whether the others do without it
+      -> again on top of these, until none does
+      -> Stribeck curves in place of friction that rises by the square, where they gain by that
+      -> again on top of these -> each asked whether the others do without it
 
 A torque fit takes a second where one by simulation takes a minute, and does not mind which
 controller kept the robot on its way. So an arm of six joints has an answer in a minute or two,
@@ -19,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
@@ -43,6 +46,9 @@ from cg_sysid.text import measured
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
 MOST = 32  # effects that are taken up
 EVERY_DRIVE = 'viscous_friction', 'coulomb_friction', 'rotor_inertia'  # has some of these
+CURVE = 'coulomb_friction', 'viscous_friction', 'stribeck_friction'  # of Stribeck, by its parts
+RISES = 'quadratic_friction'
+LOOK_LIKE_CURVES = 'coulomb_friction', RISES  # where parts of one are asked for alone
 MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
@@ -140,7 +146,11 @@ def select(
         judged = search.on_top(base, laws)
         worth = [(law, there) for law, there in judged if not law.reason]
         if not worth or len(laws) >= MOST:
-            break
+            curved = search.with_stribeck_curve(base, laws)
+            if curved is None:
+                break
+            laws, base = curved
+            continue
         least = worth[0][0].nats - settings.SELECTION.margin
         near = [(law, there) for law, there in worth if law.nats > least]
         # A drift that takes minutes is a constant: of what evidence cannot tell, the simplest.
@@ -412,6 +422,69 @@ class _Search:
             return [], base
         return laws, there
 
+    def with_stribeck_curve(
+        self, base: _Fitted, laws: Sequence[Law]
+    ) -> tuple[list[Law], _Fitted] | None:
+        """A whole Stribeck curve at a joint, in place of what was taken up part by part.
+
+        Dry friction that fades while viscous friction grows looks like dry friction that stays, or
+        that rises by the square, and on top of either nothing fades that could be seen.
+
+        Returns:
+            The laws and the base with one curve more; None where none gains.
+        """
+        taken_up = [base.model.effect(law.label) for law in laws]
+        for at in dict.fromkeys(e.at for e in taken_up if e.name in LOOK_LIKE_CURVES):
+            curve = self._curve(base, laws, at)
+            if curve is not None:
+                return curve
+        return None
+
+    def _curve(
+        self, base: _Fitted, laws: Sequence[Law], at: str | None
+    ) -> tuple[list[Law], _Fitted] | None:
+        """The same at one joint."""
+        missing = [name for name in CURVE if not _has(base.model, name, at)]
+        risen = [law for law in laws if _is(base.model.effect(law.label), RISES, at)]
+        asked_for = self.candidates(base.model)
+        if (
+            CURVE[-1] not in missing
+            or (len(missing) == 1 and not risen)  # that was asked for on top of the others
+            or not all((name, at) in asked_for for name in missing)
+        ):
+            return None
+        model = base.model
+        for law in risen:
+            model = model.without_effect(law.label)
+        for name in missing[:-1]:
+            model = model.with_effect(name, at)
+        found = scores(
+            model,
+            self.judge.train,
+            [(CURVE[-1], at)],
+            {},
+            self.carry_out,
+            numbers=base.said.values,
+            followed=_promising,
+            title=f'a Stribeck curve at {at}',
+        )
+        if found is None or not found.extended:
+            return None
+        ((extended, said),) = found.extended.values()
+        there = self.judge.with_errors(extended, said)
+        independent = there.independent()
+        more = [
+            self.judge.law(base, there, effect.label, independent)
+            for effect in extended.effects if effect.at == at and effect.name in missing
+        ]  # fmt: skip
+        count = sum(len(law.parameters) for law in more)
+        count -= sum(len(law.parameters) for law in risen)
+        gain = self.judge.gain(base, there, count, independent)
+        if gain.nats < settings.SELECTION.earned or not gain.significant:
+            return None
+        gone = {law.label for law in risen}
+        return [*(law for law in laws if law.label not in gone), *more], there
+
     def doubted(self, base: _Fitted, laws: Sequence[Law]) -> tuple[_Fitted, list[Law]]:
         """Without those laws that the others do without; what each gains beside the others."""
         laws = list(laws)
@@ -455,12 +528,24 @@ def _judged(
     return judge.law(base, there, model.effects[-1].label, independent), there
 
 
+def _is(effect: Effect, name: str, at: str | None) -> bool:
+    return (effect.name, effect.at) == (name, at)
+
+
+def _has(model: Model, name: str, at: str | None) -> bool:
+    return any(_is(effect, name, at) for effect in model.effects)
+
+
 def _followed(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
     """Those that are fitted: the best by score, and the simpler laws that these turn into."""
     best = sorted(gains, key=lambda c: -gains[c])[:FITTED]
     # What takes more numbers than the machine has gains as much, and its fit may end elsewhere.
     simpler = [(name, at) for kind, at in best for name in LIBRARY[kind].contains]
     return [c for c in dict.fromkeys([*best, *simpler]) if c in gains]
+
+
+def _promising(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
+    return [candidate for candidate, nats in gains.items() if nats > settings.SELECTION.earned]
 
 
 def _shortcomings(gain: _Gain, sizes: Sizes) -> list[str]:
