@@ -39,6 +39,16 @@ def test_friction_of_a_joint_without_a_drive_is_in_the_file():
     assert model.declarations['viscous_friction@hinge.coefficient'].unit == 'N m s/rad'
 
 
+@pytest.mark.parametrize('name', ['1', 'yes', 'a: b', 'a,b', '@left', '- joint', 'left joint'])
+def test_names_that_yaml_would_take_for_something_else_come_back(name):
+    text = CART_POLE.replace('"slide"', f'"{name}"').replace('"cart_pole"', f'"{name}"')
+    model = Model.from_text(template(parse(text), [name], [], f'{name}.urdf'))
+    assert model.name == name
+    assert model.mechanism.inputs == (f'{name}_effort',)
+    assert f'viscous_friction@{name}.coefficient' in model.declarations
+    assert model.torque_limit == 20.0
+
+
 @pytest.fixture
 def leg(tmp_path):
     """The URDF of a leg, and a recording in which something holds its shank."""

@@ -112,6 +112,14 @@ def flow(q: Quantity) -> str:
     return text.strip()
 
 
+def quoted(name: str) -> str:
+    """A name as YAML reads it back: in quotes where it needs them."""
+    text = yaml.safe_dump(
+        [name], default_flow_style=True, allow_unicode=True, width=2 * len(name) + WIDTH
+    )
+    return text.strip()[1:-1]
+
+
 def _effect(example: Model, effect: Effect) -> list[str]:
     lines = [f'- name: {effect.name}   # {shortened(effect.summary, effect.name)}']
     if effect.at:

@@ -31,7 +31,7 @@ from cg_dynamics.mechanisms.urdf import BELIEF, Urdf, nearest_real
 from cg_dynamics.model import Model
 from cg_interfaces import channels
 from cg_sysid.cli import common as cli
-from cg_sysid.cli.new_model import flow, shortened
+from cg_sysid.cli.new_model import flow, quoted, shortened
 from cg_sysid.records.bags import read_bag, read_raw
 from cg_sysid.records.noise import ChannelNoise, measure_noise
 from cg_sysid.records.record import Record
@@ -99,7 +99,7 @@ def template(
     lines = [
         HEAD.format(source=source).rstrip(),
         f'format: {FORMAT}',
-        f'name: {description.name}',
+        f'name: {quoted(description.name)}',
         'mechanism: urdf',
         'description: >-',
         '  What this robot is, in a sentence or two.',
@@ -108,7 +108,7 @@ def template(
         '# count as measured; one that a driver made of positions does not.',
         *(line for doubt in doubts for line in _comment(doubt)),
         'robot:',
-        f'  driven: [{", ".join(body.driven)}]',
+        f'  driven: [{", ".join(map(quoted, body.driven))}]',
         *_couplings(body),
         f'  rates: {str(body.rates).lower()}',
         '  urdf: |',
@@ -129,8 +129,8 @@ def template(
     by_name = {joint.name: joint for joint in description.joints}
     for joint, channel, unit in zip(body.driven, body.inputs, body.input_units, strict=True):
         lines += list(_actuator(by_name.get(joint), channel, unit))
-    lines += ['', 'provenance:   # any keys: who wrote this file, and when', f'  source: {source}',
-              '']  # fmt: skip
+    lines += ['', 'provenance:   # any keys: who wrote this file, and when']
+    lines += [f'  source: {quoted(source)}', '']
     return '\n'.join(lines)
 
 
@@ -179,7 +179,8 @@ def _couplings(body: Urdf) -> Iterator[str]:
     if body.couplings:
         yield '  couplings:   # motor -> rad that it turns, behind its gear, per rad of a joint'
     for name, ratios in body.couplings.items():
-        yield f'    {name}: {{{", ".join(f"{j}: {r!r}" for j, r in ratios.items())}}}'
+        turned = ', '.join(f'{quoted(joint)}: {ratio!r}' for joint, ratio in ratios.items())
+        yield f'    {quoted(name)}: {{{turned}}}'
 
 
 def _bodies(body: Urdf) -> Iterator[str]:
@@ -204,13 +205,13 @@ def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterat
         }
         yield f'- name: position_control   # {shortened(loop.summary, loop.name)}'
         if len(body.coordinates) > 1:
-            yield f'  at: {driven}'
+            yield f'  at: {quoted(driven)}'
         yield '  parameters:'
         yield from (f'    {name}: {gain}' for name, gain in gains.items())
     if follows:
         yield from _comment(ADDS_UP)
         for driven in body.driven:
-            at = f', at: {driven}' if len(body.coordinates) > 1 else ''
+            at = f', at: {quoted(driven)}' if len(body.coordinates) > 1 else ''
             yield f'# - {{name: integral_control{at}}}'
     stated = [
         (joint, name, getattr(joint, attribute))
@@ -222,7 +223,7 @@ def _effects(body: Urdf, description: RobotDescription, follows: bool) -> Iterat
         size = LIBRARY[name](body, joint.name).parameters[0]
         yield f'- name: {name}   # {shortened(LIBRARY[name].summary, name)}'
         if len(body.coordinates) > 1:
-            yield f'  at: {joint.name}'
+            yield f'  at: {quoted(joint.name)}'
         q = Quantity(value, size.unit, _doubt(joint, name, value), source='dynamics in the URDF')
         yield f'  parameters: {{{size.name}: {flow(q)}}}'
 
@@ -243,7 +244,7 @@ def _others(body: Urdf) -> list[str]:
 
 
 def _sensor(channel: str, unit: str, noise: ChannelNoise | None) -> Iterator[str]:
-    yield f'  {channel}:'
+    yield f'  {quoted(channel)}:'
     for key, value in (('noise', noise and noise.sigma), ('resolution', noise and noise.quantum)):
         if value:
             q = Quantity(float(f'{value:.3g}'), unit, source='seen in the recordings')
@@ -253,7 +254,7 @@ def _sensor(channel: str, unit: str, noise: ChannelNoise | None) -> Iterator[str
 
 
 def _actuator(joint: Joint | None, channel: str, unit: str) -> Iterator[str]:
-    yield f'  {channel}:'
+    yield f'  {quoted(channel)}:'
     if joint is not None and math.isfinite(joint.effort) and joint.effort > 0:
         q = Quantity(joint.effort, unit, source='effort limit in the URDF')
         yield f'    limit: {flow(q)}'
