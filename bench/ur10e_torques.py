@@ -29,7 +29,8 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.identification.torque_error import fit_by_torque
 from cg_sysid.report import friction_picture
-from cg_sysid.search.torque_selection import Law, TorqueSelection, select
+from cg_sysid.search.torque_judging import Law
+from cg_sysid.search.torque_selection import TorqueSelection, select
 from cg_sysid.text import listed, measured
 
 

@@ -32,7 +32,8 @@ from cg_sysid.progress import Bars
 from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import friction_picture
 from cg_sysid.report.diagnosis_file import plain
-from cg_sysid.search.torque_selection import Law, TorqueSelection, select
+from cg_sysid.search.torque_judging import Law
+from cg_sysid.search.torque_selection import TorqueSelection, select
 from cg_sysid.text import effect_name, listed, measured, number
 
 FORMAT = 'cg_torques/1'

@@ -4,7 +4,7 @@
       -> torque fits of the best -> that which gains most is taken up, if records held out gain too
       -> friction and rotors at all other joints as well, if they gain by that
       -> again on top of these, until none does
-      -> Stribeck curves in place of friction that rises by the square, where they gain by that
+      -> whole Stribeck curves where parts of one were taken up, if they gain by that
       -> again on top of these -> each asked whether the others do without it
 
 A torque fit takes a second where one by simulation takes a minute, and does not mind which
@@ -14,7 +14,6 @@ sensors, and what moves by itself, as a rotor behind a spring, is not asked. `di
 simulation what is found here.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,23 +24,13 @@ from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.information_criterion import block_gain, independent_samples
-from cg_sysid.identification.measured_motion import STRIDE_S
-from cg_sysid.identification.student_t import (
-    deviance_by_column,
-    deviances,
-    row_scale,
-    scale_of,
-)
 from cg_sysid.identification.torque_error import TorqueFit
-from cg_sysid.identification.unknowns import IdentificationError, unknowns_of
+from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search import settings
-from cg_sysid.search.model_selection import block_s
-from cg_sysid.search.outcome import edges, edges_in_words
 from cg_sysid.search.task import EffectAt, candidates_for
+from cg_sysid.search.torque_judging import MATERIAL, Fitted, Judge, Law
 from cg_sysid.search.torque_screening import scores
-from cg_sysid.text import measured
 
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
 MOST = 32  # effects that are taken up
@@ -49,33 +38,6 @@ EVERY_DRIVE = 'viscous_friction', 'coulomb_friction', 'rotor_inertia'  # has som
 CURVE = 'coulomb_friction', 'viscous_friction', 'stribeck_friction'  # of Stribeck, by its parts
 RISES = 'quadratic_friction'
 LOOK_LIKE_CURVES = 'coulomb_friction', RISES  # where parts of one are asked for alone
-MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
-LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
-
-Sizes = Mapping[str, tuple[float, float, str]]
-
-
-@dataclass(frozen=True)
-class Law:
-    """An effect that the torques lack.
-
-    Attributes:
-        label: Its label.
-        nats: Evidence of the records fitted to.
-        significance: Standard errors by which the torque error of records held out falls.
-        taken: Share of the squared torque error of each coordinate that it takes, shape (n,).
-        parameters: Name -> value, standard deviation, unit, by all records.
-        rivals: Labels of others that these torques cannot tell from it.
-        reason: Why it is not taken up; empty if it is worth it.
-    """
-
-    label: str
-    nats: float
-    significance: float
-    taken: np.ndarray
-    parameters: Sizes
-    rivals: tuple[str, ...] = ()
-    reason: str = ''
 
 
 @dataclass(frozen=True)
@@ -131,7 +93,7 @@ def select(
             f'model {model.name!r}: torques are compared for a robot of a URDF with an encoder at '
             'every joint that moves, and without integral_control'
         )
-    judge = _Judge(train, held)
+    judge = Judge(train, held)
     search = _Search(judge, names, carry_out)
     plain = torque_error.without_states(model)
     bare = replace(plain, effects=())
@@ -160,7 +122,7 @@ def select(
         laws += [replace(best, rivals=rivals), *more]
     base, laws = search.doubted(base, laws)
     # Who judged has no more say: the numbers are those of all records.
-    every = _Judge([*train, *held], held)
+    every = Judge([*train, *held], held)
     final = every.fit(base.model, base.said.values)
     taken_up = {law.label for law in laws}
     laws = [
@@ -180,185 +142,10 @@ def select(
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """A structure, what the torques of some records say of it, and what it leaves in all.
-
-    Attributes:
-        model: With the numbers of the file.
-        said: The torque fit.
-        train: Torque errors of each record fitted to, shape (rows, n).
-        held: The same of those held out.
-    """
-
-    model: Model
-    said: TorqueFit
-    train: list[np.ndarray]
-    held: list[np.ndarray]
-
-    @property
-    def standing(self) -> Model:
-        """The model with the numbers that the torques say."""
-        return self.model.with_values(self.said.values)
-
-    def independent(self) -> tuple[np.ndarray, np.ndarray]:
-        """Independent ones among the torques of the records fitted to: number and share, (n,)."""
-        weighted = [rows / row_scale(rows, self.said.scale) for rows in self.train]
-        steps = [STRIDE_S] * len(weighted)
-        number = np.array([
-            independent_samples([rows[:, [k]] for rows in weighted], steps)
-            for k in range(len(self.said.scale))
-        ])  # fmt: skip
-        count = np.isfinite(np.vstack(weighted)).sum(axis=0)
-        return number, number / np.maximum(count, number)
-
-    @property
-    def deviance(self) -> np.ndarray:
-        """(T) of the records fitted to, of each coordinate, (n,)."""
-        return deviance_by_column(np.vstack(self.train))
-
-    @property
-    def disbelief(self) -> float:
-        """Squared distance of the numbers from what the file believes, in its tolerances."""
-        return self.said.deviance - float(self.deviance.sum())
-
-
-@dataclass(frozen=True)
-class _Gain:
-    """What numbers more gain (diagnosis.md, section 4).
-
-    Attributes:
-        nats: Evidence of the records fitted to.
-        significance: Standard errors by which the torque error of records held out falls.
-        taken: Share of the squared torque error of each coordinate that they take, shape (n,).
-        relieved: Part of the evidence, in nats, that is belief in other numbers.
-    """
-
-    nats: float
-    significance: float
-    taken: np.ndarray
-    relieved: float
-
-    @property
-    def believed(self) -> bool:
-        """Whether they take the place of numbers that nobody believes: these lower no error.
-
-        As a payload that of a link too heavy.
-        """
-        return self.relieved > settings.SELECTION.earned
-
-    @property
-    def significant(self) -> bool:
-        """Whether records held out gain."""
-        return self.significance >= (0.0 if self.believed else settings.SELECTION.significant)
-
-
-@dataclass(frozen=True)
-class _Judge:
-    """Fits and judgements on one split of the records."""
-
-    train: Sequence[DataSet]
-    held: Sequence[DataSet]
-
-    def fit(self, model: Model, at: Mapping[str, float]) -> _Fitted:
-        """A structure fitted by torques, from given values."""
-        said = torque_error.fit_by_torque(model, self.train, at=at)
-        if said is None:
-            raise IdentificationError(
-                'no torques can be compared: the recordings are shorter than a quarter of a '
-                'second, or positions are missing in all of them'
-            )
-        return self.with_errors(model, said)
-
-    def with_errors(self, model: Model, said: TorqueFit) -> _Fitted:
-        """A torque fit of the records fitted to, and what it leaves in all."""
-        standing = model.with_values(said.values)
-        train, held = (
-            torque_error.left_by(standing, records) for records in (self.train, self.held)
-        )
-        if not held:
-            raise IdentificationError(
-                'no torques to judge by: the recordings held out are shorter than a quarter of a '
-                'second, or positions are missing in all of them'
-            )
-        return _Fitted(model, said, train, held)
-
-    def law(
-        self,
-        without: _Fitted,
-        with_it: _Fitted,
-        label: str,
-        independent: tuple[np.ndarray, np.ndarray],
-    ) -> Law:
-        """What an effect gains, and whether that is worth it (diagnosis.md, section 4).
-
-        Args:
-            without: Fitted without it.
-            with_it: Fitted with it.
-            label: Its label.
-            independent: Number and share of independent torques, of who leads (independent()).
-        """
-        sizes = self.sizes(with_it, label)
-        gain = self.gain(without, with_it, len(sizes), independent)
-        reasons = _shortcomings(gain, sizes)
-        reasons += edges_in_words(label, self._at_edge(with_it, label))
-        return Law(label, gain.nats, gain.significance, gain.taken, sizes,
-                   reason='; '.join(reasons))  # fmt: skip
-
-    def gain(
-        self,
-        without: _Fitted,
-        with_it: _Fitted,
-        count: int,
-        independent: tuple[np.ndarray, np.ndarray],
-    ) -> _Gain:
-        """What so many numbers more gain."""
-        number, share = independent
-        gained = share @ (without.deviance - with_it.deviance) / 2
-        relieved = (without.disbelief - with_it.disbelief) / 2
-        nats = gained + relieved - count / 2 * np.log(number.sum())
-        # Rows in which friction turns are far off with any law: they count as (T) has it.
-        before, after = (
-            [np.sqrt(deviances(rows, without.said.scale)) for rows in fitted.held]
-            for fitted in (without, with_it)
-        )
-        significance = block_gain(before, after, round(block_s(self.held) / STRIDE_S))
-        left, was = (scale_of(np.vstack(fitted.held)) for fitted in (with_it, without))
-        return _Gain(float(nats), significance, 1 - (left / was) ** 2, float(relieved))
-
-    def _at_edge(self, fitted: _Fitted, label: str) -> dict[str, tuple[float, str]]:
-        known = fitted.said.values
-        numbers = [(u, known[u.name]) for u in unknowns_of(fitted.model) if u.name in known]
-        return edges(label, fitted.model.effect(label).parameters, numbers)
-
-    def sizes(self, fitted: _Fitted, label: str) -> Sizes:
-        """An effect's numbers, with standard deviations by the curvature of (T) and by belief."""
-        values, own = fitted.said.values, f'{label}.'
-        unknowns = tuple(u for u in unknowns_of(fitted.model) if u.name in values)
-        problems = torque_error.problems_of(fitted.model, self.train, unknowns)
-        theta = np.array([u.to_coordinate(values[u.name]) for u in unknowns])
-        scale = np.nan_to_num(row_scale(np.vstack(fitted.train), fitted.said.scale), nan=1.0)
-        _, share = fitted.independent()
-        j = torque_error.derivatives(problems, unknowns, theta) / scale[:, :, None]
-        j = (np.sqrt(share)[:, None] * j).reshape(-1, len(unknowns))
-        curvature = j.T @ j + np.diag([1 / u.tolerance**2 for u in unknowns])
-        seen = np.diag(curvature) > 0
-        steep = np.sqrt(np.diag(curvature)[seen])
-        scaled = curvature[np.ix_(seen, seen)] / np.outer(steep, steep)
-        sigmas = np.full(len(unknowns), np.inf)
-        sigmas[seen] = np.sqrt(np.diag(np.linalg.inv(scaled + LOST * np.eye(len(steep))))) / steep
-        return {
-            u.name.removeprefix(own): (
-                values[u.name], float(sigma) * (values[u.name] if u.logarithmic else 1.0), u.unit
-            )
-            for u, sigma in zip(unknowns, sigmas, strict=True) if u.name.startswith(own)
-        }  # fmt: skip
-
-
-@dataclass(frozen=True)
 class _Search:
     """Effects, sought on one split of the records."""
 
-    judge: _Judge
+    judge: Judge
     names: Sequence[str] | None
     carry_out: CarryOut
 
@@ -373,7 +160,7 @@ class _Search:
             if _told_by_torques(model, candidate)
         ]
 
-    def on_top(self, base: _Fitted, laws: Sequence[Law]) -> list[tuple[Law, _Fitted]]:
+    def on_top(self, base: Fitted, laws: Sequence[Law]) -> list[tuple[Law, Fitted]]:
         """Effects on top of a base with these laws, fitted and judged, the best first."""
         title = f'what torques say on top of {len(laws)} laws' if laws else 'what torques say'
         found = scores(
@@ -391,7 +178,7 @@ class _Search:
         )
         return sorted(judged, key=lambda pair: -pair[0].nats)
 
-    def at_other_joints(self, base: _Fitted) -> tuple[list[Law], _Fitted]:
+    def at_other_joints(self, base: Fitted) -> tuple[list[Law], Fitted]:
         """Friction or a rotor, the last effect of a base, at all other joints, if they gain by it.
 
         An arm of which nobody knows the friction lacks some at every joint. What all the others
@@ -423,8 +210,8 @@ class _Search:
         return laws, there
 
     def with_stribeck_curve(
-        self, base: _Fitted, laws: Sequence[Law]
-    ) -> tuple[list[Law], _Fitted] | None:
+        self, base: Fitted, laws: Sequence[Law]
+    ) -> tuple[list[Law], Fitted] | None:
         """A whole Stribeck curve at a joint, in place of what was taken up part by part.
 
         Dry friction that fades while viscous friction grows looks like dry friction that stays, or
@@ -441,8 +228,8 @@ class _Search:
         return None
 
     def _curve(
-        self, base: _Fitted, laws: Sequence[Law], at: str | None
-    ) -> tuple[list[Law], _Fitted] | None:
+        self, base: Fitted, laws: Sequence[Law], at: str | None
+    ) -> tuple[list[Law], Fitted] | None:
         """The same at one joint."""
         missing = [name for name in CURVE if not _has(base.model, name, at)]
         risen = [law for law in laws if _is(base.model.effect(law.label), RISES, at)]
@@ -485,7 +272,7 @@ class _Search:
         gone = {law.label for law in risen}
         return [*(law for law in laws if law.label not in gone), *more], there
 
-    def doubted(self, base: _Fitted, laws: Sequence[Law]) -> tuple[_Fitted, list[Law]]:
+    def doubted(self, base: Fitted, laws: Sequence[Law]) -> tuple[Fitted, list[Law]]:
         """Without those laws that the others do without; what each gains beside the others."""
         laws = list(laws)
         while len(laws) > 1:
@@ -499,7 +286,7 @@ class _Search:
             lean = [self.judge.with_errors(m, fit) for m, fit in zip(models, said, strict=True)]
             independent = base.independent()
             judged = self.carry_out(
-                _Judge.law,
+                Judge.law,
                 [(self.judge, fit, base, law.label, independent)
                  for fit, law in zip(lean, laws, strict=True)],
                 title,
@@ -517,12 +304,12 @@ class _Search:
 
 
 def _judged(
-    judge: _Judge,
-    base: _Fitted,
+    judge: Judge,
+    base: Fitted,
     model: Model,
     said: TorqueFit,
     independent: tuple[np.ndarray, np.ndarray],
-) -> tuple[Law, _Fitted]:
+) -> tuple[Law, Fitted]:
     """What the last effect of a model gains on top of a base."""
     there = judge.with_errors(model, said)
     return judge.law(base, there, model.effects[-1].label, independent), there
@@ -546,21 +333,6 @@ def _followed(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
 
 def _promising(gains: Mapping[EffectAt, float]) -> list[EffectAt]:
     return [candidate for candidate, nats in gains.items() if nats > settings.SELECTION.earned]
-
-
-def _shortcomings(gain: _Gain, sizes: Sizes) -> list[str]:
-    """Why what an effect gains is not worth it."""
-    found = []
-    if gain.nats < settings.SELECTION.earned:
-        found.append(f'evidence {gain.nats:.1f} nats, {settings.SELECTION.earned:g} needed')
-    if not gain.significant:
-        found.append('no significant gain on recordings held out')
-    if np.nanmax(gain.taken) < MATERIAL and not gain.believed:
-        found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
-    for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
-        if abs(size) < settings.SELECTION.too_small * sigma:
-            found.append(f'{name} = {measured(size, sigma, unit)} may be none')
-    return found
 
 
 def _told_by_torques(model: Model, candidate: EffectAt) -> bool:
