@@ -20,6 +20,7 @@ from cg_sysid.identification.torque_error import (
     can,
     fit_by_torque,
     fits_by_torque,
+    left_by,
     problems_of,
 )
 from cg_sysid.identification.windows import followed
@@ -354,6 +355,24 @@ def test_a_fit_with_play_sets_out_from_torques():
     # Noise alone gives 1. By simulation alone the best of nine starts comes to 5.2, and half of
     # them stay above 50.
     assert np.median(errors) < 1.1
+
+
+def test_what_nothing_drives_is_judged_alike_whatever_load_a_model_has():
+    """A pole with a load has more inertia, and its acceleration is as wrong as before."""
+    believed = Model.from_text(CART_POLE)
+    load = {'mass': 0.17, 'x': 0.01, 'y': 0.0, 'z': -0.54}
+    machine = believed.with_effect('payload', 'pole', **load)
+    data_sets = prepare(believed, [ride(machine, k) for k in range(2)])
+    plain = fit_by_torque(believed, data_sets)
+    loaded = [believed.with_effect('payload', 'pole', mass=start) for start in (0.05, 0.5)]
+    light, heavy = (fit_by_torque(model, data_sets) for model in loaded)
+    assert light.deviance == pytest.approx(heavy.deviance, abs=1.0)
+    assert (plain.deviance - light.deviance) / 2 > SEEN
+    assert light.values['payload@pole.mass'] == pytest.approx(load['mass'], rel=0.2)
+    # As it stands a model is judged in the same units as when it was fitted.
+    standing = loaded[1].with_values(light.values)
+    left = scale_of(np.vstack(left_by(standing, data_sets)))
+    np.testing.assert_allclose(left, light.scale, rtol=1e-6)
 
 
 def test_what_nothing_drives_does_not_lose_its_weight():

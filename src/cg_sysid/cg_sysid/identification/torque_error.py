@@ -385,7 +385,8 @@ def _units(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.
 
     Of what a drive moves that is the torque that it reports: that it delivers nothing, and nothing
     weighs anything, would leave no error. Of what nothing drives it is the acceleration, times the
-    inertia believed, as there all terms grow with the masses.
+    inertia of the bodies of the URDF, as there all terms grow with the masses. That inertia is the
+    same whatever a model says: a payload, or masses that a fit has moved, would seem more wrong.
 
     Args:
         model: Without states.
@@ -394,7 +395,8 @@ def _units(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.
         typical: Torque on each free coordinate, N m (N), shape (m,).
     """
     own = ca.diag(e.mass_matrix)
-    believed = ca.substitute(own, e.p, parameter_vector(model, setup))
+    neutral = {n: q.neutral for n, q in model.declarations.items() if q.neutral is not None}
+    believed = ca.substitute(own, e.p, parameter_vector(model.with_values(neutral), setup))
     driving = _driving(model, setup) != 0
     units = []
     for k in range(e.coordinates):
