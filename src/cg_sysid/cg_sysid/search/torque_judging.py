@@ -29,6 +29,7 @@ from cg_sysid.search.outcome import edges, edges_in_words
 from cg_sysid.text import measured
 
 MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
+EVERY_JOINT = 'viscous_friction', 'coulomb_friction'  # has them: a little is no surprise
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
 Sizes = Mapping[str, tuple[float, float, str]]
@@ -177,7 +178,8 @@ class Judge:
         """
         sizes = self.sizes(with_it, label)
         gain = self.gain(without, with_it, len(sizes), independent)
-        reasons = _shortcomings(gain, sizes)
+        expected = with_it.model.effect(label).name in EVERY_JOINT
+        reasons = _shortcomings(gain, sizes, expected)
         reasons += edges_in_words(label, self._at_edge(with_it, label))
         return Law(label, gain.nats, gain.significance, gain.taken, sizes,
                    reason='; '.join(reasons))  # fmt: skip
@@ -232,14 +234,14 @@ class Judge:
         }  # fmt: skip
 
 
-def _shortcomings(gain: Gain, sizes: Sizes) -> list[str]:
+def _shortcomings(gain: Gain, sizes: Sizes, expected: bool) -> list[str]:
     """Why what an effect gains is not worth it."""
     found = []
     if gain.nats < settings.SELECTION.earned:
         found.append(f'evidence {gain.nats:.1f} nats, {settings.SELECTION.earned:g} needed')
     if not gain.significant:
         found.append('no significant gain on recordings held out')
-    if np.nanmax(gain.taken) < MATERIAL and not gain.believed:
+    if np.nanmax(gain.taken) < MATERIAL and not (gain.believed or expected):
         found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
     for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
         if abs(size) < settings.SELECTION.too_small * sigma:
