@@ -25,6 +25,7 @@ from cg_dynamics.model import Model
 from cg_sysid.checks.loading import Loaded, load_bags
 from cg_sysid.cli import common as cli
 from cg_sysid.diagnosis.diagnose import split
+from cg_sysid.diagnosis.summary import is_determined
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.parallel import run_all
@@ -32,7 +33,7 @@ from cg_sysid.progress import Bars
 from cg_sysid.provenance import of_model, provenance
 from cg_sysid.report import friction_picture
 from cg_sysid.report.diagnosis_file import plain
-from cg_sysid.search.torque_judging import Law
+from cg_sysid.search.torque_judging import MATERIAL, Law
 from cg_sysid.search.torque_selection import TorqueSelection, select
 from cg_sysid.text import effect_name, listed, measured, number
 
@@ -147,6 +148,7 @@ def _law_facts(law: Law, joints: Sequence[str]) -> Facts:
             name: {'value': value, 'sigma': sigma, 'unit': unit}
             for name, (value, sigma, unit) in law.parameters.items()
         },
+        'relieves': law.relieves,
         'rivals': law.rivals,
         'reason': law.reason,
     }
@@ -187,13 +189,22 @@ def show(console: Console, found: TorqueSelection, directory: Path, quiet: bool)
 
 
 def _show_law(console: Console, law: Law, shares: Mapping[str, float]) -> None:
-    numbers = ', '.join(f'{name} = {measured(*told)}' for name, told in law.parameters.items())
+    numbers = ', '.join(
+        f'{name} = {measured(*told)}'
+        if is_determined(law.label, name, told[1]) else f'{name} not determined'
+        for name, told in law.parameters.items()
+    )  # fmt: skip
     console.print(
         f'  [bold]{effect_name(law.label)}[/]: {numbers}  (evidence {law.nats:.0f} nats)',
         highlight=False,
     )
     at = [f'{share:.0%} at {joint}' for joint, share in shares.items()]
-    takes = f'of the squared error: {listed(at)}' if at else 'the place of numbers off belief'
+    if at:
+        takes = f'of the squared error: {listed(at)}'
+    elif law.relieves:
+        takes = 'the place of numbers off belief'
+    else:
+        takes = f'less than {MATERIAL:.0%} of the squared error, as every joint has some'
     console.print(f'    takes {takes}', highlight=False)
     for rival in law.rivals:
         console.print(f'    or: {effect_name(rival)}', highlight=False)

@@ -45,6 +45,7 @@ class Law:
         significance: Standard errors by which the torque error of records held out falls.
         taken: Share of the squared torque error of each coordinate that it takes, shape (n,).
         parameters: Name -> value, standard deviation, unit, by all records.
+        relieves: Whether it takes the place of numbers that nobody believes.
         rivals: Labels of others that these torques cannot tell from it.
         reason: Why it is not taken up; empty if it is worth it.
     """
@@ -54,6 +55,7 @@ class Law:
     significance: float
     taken: np.ndarray
     parameters: Sizes
+    relieves: bool = False
     rivals: tuple[str, ...] = ()
     reason: str = ''
 
@@ -181,7 +183,7 @@ class Judge:
         expected = with_it.model.effect(label).name in EVERY_JOINT
         reasons = _shortcomings(gain, sizes, expected)
         reasons += edges_in_words(label, self._at_edge(with_it, label))
-        return Law(label, gain.nats, gain.significance, gain.taken, sizes,
+        return Law(label, gain.nats, gain.significance, gain.taken, sizes, gain.believed,
                    reason='; '.join(reasons))  # fmt: skip
 
     def gain(
