@@ -1,10 +1,9 @@
-"""The tests that are marked `evidence`: more cases of what the suite shows with fewer.
+"""The tests that are marked `evidence`: long ones, and more cases of what the suite shows.
 
     ./cg exec python bench/evidence.py [--write]
 
 Runs them with all their assertions, one process a core, and prints a table; `--write` stores it
-as bench/results/evidence.md. `make test` leaves them out: together they keep two cores busy for
-half an hour.
+as bench/results/evidence.md. `make test` leaves them out.
 """
 
 import argparse
