@@ -13,7 +13,6 @@ from cg_bringup.demo import PROGRAMME, main, run_demo
 RIVALS = 'torque_constant,torque_bias,actuator_delay,encoder_scale'
 
 
-@pytest.mark.evidence
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ('candidates', 'duration'),

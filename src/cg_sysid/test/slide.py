@@ -1,4 +1,4 @@
-"""A cart on a rail that carries a pole; what drives it is a slide."""
+"""A cart on a rail, which a drive moves, and a pole that swings from it freely."""
 
 import numpy as np
 

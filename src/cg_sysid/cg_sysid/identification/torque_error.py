@@ -386,7 +386,7 @@ def _units(model: Model, e: Equations, setup: Setup, typical: np.ndarray) -> ca.
     Of what a drive moves that is the torque that it reports: that it delivers nothing, and nothing
     weighs anything, would leave no error. Of what nothing drives it is the acceleration, times the
     inertia of the bodies of the URDF, as there all terms grow with the masses. That inertia is the
-    same whatever a model says: a payload, or masses that a fit has moved, would seem more wrong.
+    same whatever a model says: else a payload, or masses that a fit has moved, would seem wrong.
 
     Args:
         model: Without states.

@@ -120,7 +120,7 @@ class Gain:
     relieved: float
 
     @property
-    def believed(self) -> bool:
+    def relieves(self) -> bool:
         """Whether they take the place of numbers that nobody believes: these lower no error.
 
         As a payload that of a link too heavy.
@@ -130,7 +130,7 @@ class Gain:
     @property
     def significant(self) -> bool:
         """Whether records held out gain."""
-        return self.significance >= (0.0 if self.believed else settings.SELECTION.significant)
+        return self.significance >= (0.0 if self.relieves else settings.SELECTION.significant)
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Judge:
         expected = with_it.model.effect(label).name in EVERY_JOINT
         reasons = _shortcomings(gain, sizes, expected)
         reasons += edges_in_words(label, self._at_edge(with_it, label))
-        return Law(label, gain.nats, gain.significance, gain.taken, sizes, gain.believed,
+        return Law(label, gain.nats, gain.significance, gain.taken, sizes, gain.relieves,
                    reason='; '.join(reasons))  # fmt: skip
 
     def gain(
@@ -243,7 +243,7 @@ def _shortcomings(gain: Gain, sizes: Sizes, expected: bool) -> list[str]:
         found.append(f'evidence {gain.nats:.1f} nats, {settings.SELECTION.earned:g} needed')
     if not gain.significant:
         found.append('no significant gain on recordings held out')
-    if np.nanmax(gain.taken) < MATERIAL and not (gain.believed or expected):
+    if np.nanmax(gain.taken) < MATERIAL and not (gain.relieves or expected):
         found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
     for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
         if abs(size) < settings.SELECTION.too_small * sigma:

@@ -29,12 +29,12 @@ from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.parallel import CarryOut, one_by_one
 from cg_sysid.search import settings
 from cg_sysid.search.task import EffectAt, candidates_for
-from cg_sysid.search.torque_judging import MATERIAL, Fitted, Judge, Law
+from cg_sysid.search.torque_judging import EVERY_JOINT, MATERIAL, Fitted, Judge, Law
 from cg_sysid.search.torque_screening import scores
 
 FITTED = 6  # effects that are fitted in a round, those that the scores promise most of
 MOST = 32  # effects that are taken up
-EVERY_DRIVE = 'viscous_friction', 'coulomb_friction', 'rotor_inertia'  # has some of these
+EVERY_DRIVE = *EVERY_JOINT, 'rotor_inertia'  # has some of these
 CURVE = 'coulomb_friction', 'viscous_friction', 'stribeck_friction'  # of Stribeck, by its parts
 RISES = 'quadratic_friction'
 LOOK_LIKE_CURVES = 'coulomb_friction', RISES  # where parts of one are asked for alone
