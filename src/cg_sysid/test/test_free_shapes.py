@@ -68,8 +68,10 @@ def _led_by(comparison, name):
     return replace(comparison, ranked=tuple(sorted(pairs, key=lambda pair: -pair[0].evidence)))
 
 
-def test_the_law_that_fits_with_its_shape_let_go_is_first(search):
+def test_the_law_that_fits_with_its_shape_let_go_is_first(search, monkeypatch):
     work, comparison = search
+    # Else the simpler one of the two is taken at once where so much is unexplained.
+    monkeypatch.setattr(settings, 'SELECTION', replace(settings.SELECTION, far_off=np.inf))
     wrong = _led_by(comparison, OTHER)
     assert wrong.winner()[1].train.normalised_error > settings.NOISE.quick
     free = compared_with_free_shapes(work, wrong)

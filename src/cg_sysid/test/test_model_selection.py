@@ -136,6 +136,27 @@ def test_what_takes_hardly_more_than_a_simpler_effect_is_not_preferred(
     assert candidate.label == 'joint_flexibility@hip'
 
 
+@pytest.mark.parametrize(
+    ('simple', 'elaborate', 'chosen'),
+    [
+        (270.0, 100.0, 'viscous_friction@knee'),  # It explains 730 of 900 variances.
+        (300.0, 100.0, 'presliding_friction@knee'),
+        (50.0, 10.0, 'presliding_friction@knee'),  # Little is unexplained.
+    ],
+)
+def test_where_most_is_unexplained_the_simpler_of_two_laws_is_taken_first(
+    fitted, simple, elaborate, chosen
+):
+    selection, base, (one, _), _ = fitted
+    base = _leaving(base, 1e3, 1e3)
+    left = {'viscous_friction@knee': simple, 'presliding_friction@knee': elaborate}
+    found = [replace(_leaving(one, error, error), label=label) for label, error in left.items()]
+    comparison = selection.compare(base, found)
+    pairs = [(replace(candidate, reason=''), o) for candidate, o in comparison.ranked]
+    candidate, _ = replace(comparison, ranked=tuple(pairs), margin=0.1).winner()
+    assert candidate.label == chosen
+
+
 def test_nothing_can_be_earned_where_too_little_is_left(fitted):
     selection, base, _, _ = fitted
     assert selection.nothing_material(_leaving(base, 1.0, 1.85))

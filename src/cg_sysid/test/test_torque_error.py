@@ -28,7 +28,7 @@ from cg_sysid.search import look
 from cg_sysid.search.outcome import shared_unknowns
 from cg_sysid.search.starts import starts_of
 from cg_sysid.search.task import Rival, Task, candidates_for
-from cg_sysid.search.torque_screening import KEPT, SEEN, Scores, scores
+from cg_sysid.search.torque_screening import KEPT, SEEN, WORST, Scores, scores
 from cg_sysid.search.whole_fit import try_candidate
 
 OFF = {
@@ -203,6 +203,14 @@ def test_of_few_joints_more_candidates_are_looked_at(joints, looks):
     fitted = laws | {best: 200.0}
     kept = Scores(fitted, fitted, names).worth(list(fitted))
     assert kept == [*list(laws)[: looks - 1], best]
+
+
+def test_what_a_joint_loses_in_each_swing_is_looked_at_though_torques_hardly_show_it():
+    joints = tuple(f'joint_{k}' for k in range(6))
+    losses = [('viscous_friction', joint) for joint in joints]
+    rub = {('coulomb_friction', joint): 0.5 for joint in joints}
+    found = Scores(rub | dict.fromkeys(losses, 0.2), {}, joints)
+    assert found.worth([*rub, *losses]) == losses[:WORST]
 
 
 def test_what_gains_by_a_fit_and_not_by_the_score_rules_nobody_out():

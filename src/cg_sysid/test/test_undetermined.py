@@ -17,9 +17,11 @@ from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.gain import Gain
 from cg_sysid.identification.identify import fit
+from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.learned.shape import Shape
 from cg_sysid.learned.unmodelled import Unmodelled
 from cg_sysid.search.model_selection import ModelSelection
+from cg_sysid.search.outcome import edges
 from cg_sysid.search.task import Task
 from cg_sysid.search.whole_fit import try_candidate
 
@@ -75,6 +77,14 @@ def test_a_cause_knows_which_of_its_numbers_ended_at_an_edge(nominal):
     values[place] = found.train.unknowns[place].upper
     ended = replace(found, train=replace(found.train, values=values))
     assert as_in(ended, Cause(label, {}, 900.0)).at_edge == ('error',)
+
+
+@pytest.mark.parametrize(('torque', 'ends'), [(0.0, True), (2e-5, False), (50.0, True)])
+def test_little_friction_of_a_light_machine_is_no_edge(nominal, torque, ends):
+    name = 'coulomb_friction'
+    model = nominal.without_effect(name).with_effect(name, torque=torque)
+    known = [(u, model.values[u.name]) for u in unknowns_of(model)]
+    assert ('torque' in edges(name, model.effect(name).parameters, known)) == ends
 
 
 def test_the_summary_says_where_a_number_ended_at_an_edge():

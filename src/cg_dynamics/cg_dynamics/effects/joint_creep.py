@@ -20,6 +20,7 @@ class JointCreep(Effect):
         'A spring across the joint gives way in time, so that the way back differs from the way '
         'there: tau = -stiffness (angle - c), dc/dt = (angle - c)/time_constant.'
     )
+    contains = ('viscous_friction',)
     parameters = (
         Parameter(
             'stiffness', 'N m/rad', 'against fast motion', 0.0, 1e3,

@@ -22,7 +22,7 @@ class PreslidingFriction(Effect):
         'Dry friction that first yields like a spring (Dahl; LuGre with damping): '
         '-torque b - damping s, s = rate - |rate| b, db/dt = s / deflection.'
     )
-    contains = ('coulomb_friction',)
+    contains = ('coulomb_friction', 'viscous_friction')
     parameters = (
         Parameter(
             'torque', 'N m', 'level of dry friction once it slides', 0.0, 50.0,

@@ -170,10 +170,10 @@ def warnings_of(fit: Fit, bounds: Collection[str]) -> Iterator[str]:
         if u.name in bounds:
             continue  # the bound is a statement, not a finding
         unit = '' if u.unit == '1' else f' {u.unit}'
-        span = u.upper - u.lower
+        near = 1e-6 * min(u.upper - u.lower, u.scale)
         declared = fit.model.declarations[u.name]
         inside = {'lower': value - u.lower, 'upper': u.upper - value}
-        at_edge = any(inside[end] <= 1e-6 * span for end in inside.keys() - declared.ends)
+        at_edge = any(inside[end] <= near for end in inside.keys() - declared.ends)
         if at_edge and value != declared.neutral:
             yield f'{u.name} = {value:.4g}{unit} lies at the edge of its range'
         if not np.isfinite(sigma):

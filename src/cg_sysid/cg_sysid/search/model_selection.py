@@ -51,7 +51,8 @@ class Comparison:
     def winner(self) -> tuple[Candidate, Outcome] | None:
         """The best candidate that is earned, or a simpler one that it contains.
 
-        The simpler one if that comes within the margin, or leaves hardly more.
+        The simpler one if that comes within the margin, or leaves hardly more, or explains nearly
+        as much where most is unexplained still.
         """
         able = [pair for pair in self.ranked if not pair[0].reason]
         if not able:
@@ -61,9 +62,22 @@ class Comparison:
             (candidate, o)
             for candidate, o in able
             if contains(leader.label, candidate.label)
-            and (candidate.evidence > leader.evidence - self.margin or hardly_more(best, o))
+            and (
+                candidate.evidence > leader.evidence - self.margin
+                or hardly_more(best, o)
+                or self._nearly_as_much(best, o)
+            )
         ]
         return simpler[0] if simpler else able[0]
+
+    def _nearly_as_much(self, best: Outcome, simpler: Outcome) -> bool:
+        """Whether a simpler effect explains nearly as much, and the better one far from all.
+
+        An error of many times the noise has other causes too, and more numbers bend to those.
+        """
+        was, left, by_simpler = (above_noise(o) for o in (self.base, best, simpler))
+        least = settings.SELECTION.nearly_as_much * (was - left)
+        return left > settings.SELECTION.far_off and was - by_simpler > least
 
     def less(self, label: str, reason: str) -> 'Comparison':
         """The comparison with the candidate of that label turned down after all."""

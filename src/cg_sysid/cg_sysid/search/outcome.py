@@ -238,9 +238,11 @@ def edges(
     """Parameters of an effect at the edge of their range, with value and unit.
 
     But for a part of an effect that may well be absent: the edge is where it vanishes; and where
-    physics ends with the range.
+    physics ends with the range. How near to nothing a size may be is for `too_small` to say: light
+    machines rub little.
     """
     found = {}
+    sizes = {f'{label}.{p.name}' for p in declared if p.neutral == p.lower}
     optional = {f'{label}.{p.name}' for p in declared[1:] if p.neutral == p.lower}
     ends = {f'{label}.{p.name}': p.ends for p in declared}
     for u, v in fitted:
@@ -255,7 +257,8 @@ def edges(
         if not u.logarithmic:
             margin = min(margin, 0.1 * u.scale)
         physical = ends.get(u.name, ())
-        below = low + margin if u.name not in optional and 'lower' not in physical else -np.inf
+        nearest = low if u.name in sizes else low + margin
+        below = nearest if u.name not in optional and 'lower' not in physical else -np.inf
         above = high - margin if 'upper' not in physical else np.inf
         if not below < at < above:
             found[u.name.removeprefix(f'{label}.')] = float(v), u.unit

@@ -159,6 +159,9 @@ class Selection:
             shape of their laws, 3 % off. Who explains that leaves no more of it than `mishap`.
         says_more: Independent samples of a record for each value that it has of its own.
         too_small: Standard deviations within which an effect's size may be none at all.
+        far_off: Squared error above the noise, in variances, that has other causes too.
+        nearly_as_much: Of the squared error that a law explains: a simpler one, which it contains,
+            is preferred from here on where that much is left.
     """
 
     margin: float = 6.0
@@ -178,6 +181,8 @@ class Selection:
     remainder: float = 1e-3
     says_more: float = 4.0
     too_small: float = 2.0
+    far_off: float = 10.0
+    nearly_as_much: float = 0.8
 
 
 @dataclass(frozen=True)

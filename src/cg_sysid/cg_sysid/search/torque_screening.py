@@ -55,6 +55,7 @@ NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 IDLE = 0.1  # share below which one can wait for the next round
 LATE = 1e-2  # share below which a delay can wait too
 WORST = 2  # joints on which effects with states are looked at
+LOSS = 'viscous_friction'  # of which a simulation of seconds tells more than torques do
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
 BLOCK = 12  # rows, 0.5 s
 QUIET = 0.9  # share of the blocks at least in which nobody pushes
@@ -106,6 +107,8 @@ class Scores:
             and (name, at) not in self.fitted
             and _on_worst(name, at, self.worst)
         }
+        # What a joint loses in each swing adds up in a simulation, and drowns in noisy rates here.
+        unseen |= {c for c in candidates if c[0] == LOSS and _on_worst(*c, self.worst)}
         # Smoothed torques know little of delays: they wait beside what gains far more only.
         unseen |= {
             c for c in candidates if _late(c[0]) and not self.gains.get(c, np.inf) < LATE * best
