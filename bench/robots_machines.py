@@ -111,6 +111,8 @@ ROBOTS = {
               ('pan_joint', 'lift_joint', 'elbow_joint', 'wrist_1_joint', 'wrist_2_joint',
                'wrist_3_joint'), 'tool0', (1.4, 0.9, 1.2, 1.4, 1.5, 1.8), (0.1, 0.6),
               (5e-5,) * 6, (2**17 / TURN,) * 6, rate=250.0, records=8, seconds=10.0),
+        Robot('small_furuta', ('arm_joint', 'pendulum_joint'), ('arm_joint',), 'pendulum',
+              (0.8, 0.7), (0.4, 3.5), (1e-4, 1e-4), (2048 / TURN, 2048 / TURN), push=0.0011),
     )
 }  # fmt: skip
 
@@ -571,10 +573,17 @@ EFFECTS: dict[str, Wrong] = {
     'backlash': play,
     'external_push': push,
 }
-CARRIED = {'arm2': 1.58, 'leg3': 0.4, 'cartpole': 0.236, 'furuta': 0.121, 'arm6': 1.4}  # kg
+CARRIED = {
+    'arm2': 1.58,
+    'leg3': 0.4,
+    'cartpole': 0.236,
+    'furuta': 0.121,
+    'arm6': 1.4,
+    'small_furuta': 0.02,
+}  # kg
 TIPS = {
     'arm2': (0.0, 0.0, -0.03), 'leg3': (0.0, 0.0, -0.02), 'cartpole': (0.0, 0.0, -0.55),
-    'furuta': (0.01, 0.0, -0.29), 'arm6': (0.0, 0.05, 0.06),
+    'furuta': (0.01, 0.0, -0.29), 'arm6': (0.0, 0.05, 0.06), 'small_furuta': (0.004, 0.0, -0.125),
 }  # fmt: skip
 JOINT = (
     'viscous_friction', 'coulomb_friction', 'stribeck_friction', 'torque_constant',
