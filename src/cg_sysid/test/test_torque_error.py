@@ -1,5 +1,7 @@
 """What torques say of a robot before anything is simulated."""
 
+from dataclasses import replace
+
 import finger
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ from cg_sysid.search import look
 from cg_sysid.search.outcome import shared_unknowns
 from cg_sysid.search.starts import starts_of
 from cg_sysid.search.task import Rival, Task, candidates_for
-from cg_sysid.search.torque_screening import KEPT, SEEN, WORST, Scores, scores
+from cg_sysid.search.torque_screening import HINT, KEPT, SEEN, WORST, Scores, scores
 from cg_sysid.search.whole_fit import try_candidate
 
 OFF = {
@@ -211,6 +213,32 @@ def test_what_a_joint_loses_in_each_swing_is_looked_at_though_torques_hardly_sho
     rub = {('coulomb_friction', joint): 0.5 for joint in joints}
     found = Scores(rub | dict.fromkeys(losses, 0.2), {}, joints)
     assert found.worth([*rub, *losses]) == losses[:WORST]
+
+
+def test_where_torques_show_their_noise_alone_who_gains_most_rules_nobody_out():
+    load, rub = ('payload', 'shank'), ('stribeck_friction', 'hip_joint')
+    little = ('torque_bias', 'hip_joint')
+    gains = {load: 280.0, rub: 10.5, little: HINT / 2}
+    found = Scores(gains, {load: 280.0, rub: 10.5}, ('hip_joint',))
+    assert found.worth(list(gains)) == [load]
+    assert replace(found, at_noise=True).worth(list(gains)) == [load, rub]
+
+
+@pytest.mark.parametrize(('noise', 'alone'), [(0.0, False), (3e-3, True)])
+def test_whether_torques_show_their_noise_alone_is_told_by_that_of_the_encoders(
+    believed, noise, alone
+):
+    # Dry friction is 1 N m where the model has 0.1.
+    true = believed.with_values(OFF).with_effect('stribeck_friction', 'thigh_joint', torque=0.9)
+    random = np.random.default_rng(5)
+    train = [
+        replace(
+            d, outputs=d.outputs + noise * random.standard_normal(d.outputs.shape),
+            sigma=np.hypot(d.sigma, noise),
+        )
+        for d in data(true, believed)
+    ]  # fmt: skip
+    assert scores(believed, train, [('torque_bias', 'hip_joint')], {}).at_noise == alone
 
 
 def test_what_gains_by_a_fit_and_not_by_the_score_rules_nobody_out():

@@ -54,6 +54,8 @@ LOOKS = 32  # and so many over the number of joints: looks at robots of few join
 NEAR = 0.5  # share of the best one's gain from which one is kept beyond these
 IDLE = 0.1  # share below which one can wait for the next round
 LATE = 1e-2  # share below which a delay can wait too
+AT_NOISE = 1.3  # times what the noise of the encoders makes: up to here torques show nothing else
+HINT = 1.0  # nats, from which a candidate then gets a look
 WORST = 2  # joints on which effects with states are looked at
 LOSS = 'viscous_friction'  # of which a simulation of seconds tells more than torques do
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
@@ -75,6 +77,7 @@ class Scores:
         worst: Joints, those of which torques are explained or motions simulated worst first.
         pushed: What pushes once, where it may have: (effect, place).
         extended: The base with each of `fitted` where it has a fit, at its start, and that fit.
+        at_noise: Whether the torque errors of the base are no more than encoders make of theirs.
     """
 
     gains: dict[EffectAt, float]
@@ -82,6 +85,7 @@ class Scores:
     worst: tuple[str, ...]
     pushed: tuple[EffectAt, ...] = ()
     extended: dict[EffectAt, tuple[Model, TorqueFit]] = field(default_factory=dict)
+    at_noise: bool = False
 
     def worth(self, candidates: Sequence[EffectAt]) -> list[EffectAt]:
         """Those to be looked at."""
@@ -100,6 +104,8 @@ class Scores:
             for place, c in enumerate(ordered)
             if promised[c] > max(SEEN, (IDLE if place < kept else NEAR) * best)
         }
+        if self.at_noise:  # what gains most there is not far ahead of the others
+            seen |= {c for c, gain in self.gains.items() if gain > HINT}
         unseen = {
             (name, at)
             for name, at in candidates
@@ -189,7 +195,8 @@ def scores(
     }
     pushers = [c for c in candidates if _happens(c[0])]
     pushed = base.pushed(pushers, [*train, *held]) if pushers else ()
-    return Scores(gains, by_fit, worst, pushed, extended)
+    at_noise = bool((np.nan_to_num(base.fitted.scale) < AT_NOISE * noise).all())
+    return Scores(gains, by_fit, worst, pushed, extended, at_noise)
 
 
 @dataclass(frozen=True)
