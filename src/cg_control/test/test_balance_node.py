@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
 from cg_control.balance_node import BalanceNode  # noqa: E402
+from cg_control.balancing.balance import BalanceDesign  # noqa: E402
 from cg_interfaces.domains import own_domain  # noqa: E402
 from cg_interfaces.ros import SENSOR_QOS, to_nanoseconds, to_stamp  # noqa: E402
 
@@ -148,21 +149,28 @@ def test_a_change_of_a_weight_delays_no_answer(bench):
     """It neither computes for long in the thread of the loop nor waits for anybody.
 
     Whoever starts a process sleeps until it runs, and sampling a basin takes a second. The
-    kernel counts both for this thread alone, so that it does not matter what else runs.
+    kernel counts both for this thread alone, so that it does not matter what else runs. The
+    measure is the time that the gains alone take, so that the speed of the machine does not
+    matter either: 1.7 times that was measured.
     """
-    used = []
+    design = bench.balance.design
+    gains = BalanceDesign(bench.balance.model, bench.balance.sample_time)
+    used, alone = [], []
     for k in range(60):
+        begun = Spent()
+        gains.gains(design.controller.settings)
+        alone.append(begun.used()[0])
         message = bench.message(k)
         begun = Spent()
         assert bench.set(lean_scale=0.075 if k % 2 else 0.1).successful
         bench.balance.on_state(message)
-        bench.balance.design.collect()
+        design.collect()
         used.append(begun.used())
-        assert bench.balance.design.controller.settings is bench.balance.declared.values
+        assert design.controller.settings is bench.balance.declared.values
     seconds, sleeps = (sorted(column) for column in zip(*used, strict=True))
     # The quickest tenth: others may empty the caches of this core. And in nine of ten it never
     # sleeps: now and then it has to wait for a lock of the middleware.
-    assert seconds[6] < 0.5 * bench.balance.declared.values.deadline
+    assert seconds[6] < 3.0 * sorted(alone)[6]
     assert sleeps[54] == 0
 
 
