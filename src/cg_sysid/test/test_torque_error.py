@@ -19,6 +19,7 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.identify import fit
 from cg_sysid.identification.student_t import SCALED, TAILS, deviance, row_scale, scale_of
 from cg_sysid.identification.torque_error import (
+    all_rows,
     can,
     fit_by_torque,
     fits_by_torque,
@@ -407,7 +408,7 @@ def test_what_nothing_drives_is_judged_alike_whatever_load_a_model_has():
     assert light.values['payload@pole.mass'] == pytest.approx(load['mass'], rel=0.2)
     # As it stands a model is judged in the same units as when it was fitted.
     standing = loaded[1].with_values(light.values)
-    left = scale_of(np.vstack(left_by(standing, data_sets)))
+    left = scale_of(all_rows(left_by(standing, data_sets)))
     np.testing.assert_allclose(left, light.scale, rtol=1e-6)
 
 

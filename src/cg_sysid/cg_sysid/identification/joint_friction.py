@@ -48,7 +48,9 @@ def friction_of(model: Model, data_sets: Sequence[DataSet]) -> dict[str, JointFr
     rates = [p.of_all(p.motion.rate) for p in torque_error.problems_of(model, data_sets, ())]
     if not rates:
         return {}
-    measured, left = (np.vstack(torque_error.left_by(m, data_sets)) for m in (bodies, model))
+    measured, left = (
+        torque_error.all_rows(torque_error.left_by(m, data_sets)) for m in (bodies, model)
+    )
     found = {}
     for joint, *columns in zip(
         model.mechanism.coordinates, np.vstack(rates).T, measured.T, left.T, strict=True

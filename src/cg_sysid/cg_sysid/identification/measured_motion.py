@@ -2,7 +2,7 @@
 
 Torques are averaged with the weights with which such an acceleration averages the true one, so
 that both sides of an equation of motion have seen the same: of a constant inertia it is exact,
-however fast it moves.
+however fast it moves. That is why a window may be as long as the noise of the encoders asks.
 """
 
 import functools
@@ -17,15 +17,17 @@ from cg_sysid.identification.along_motion import Samples
 from cg_sysid.identification.data_set import DataSet
 
 HALF_WIDTH_S = 0.06  # of the window of a local polynomial: motions up to some 5 Hz
+LONGER = 2.0  # times that at most, where encoders are coarse: motions up to some 2.5 Hz
+NOISY = 0.02  # of what a joint accelerates: more noise than that asks for longer windows
 MOVING_S = 0.01  # half width of the window of the motion that moves a rotor
 LEAST_HALF_WIDTH = 3  # samples
 DEGREE = 4  # of the polynomial
-STRIDE_S = 0.04  # between rows: windows that share less than half of their samples
+STRIDE = 2 / 3  # of half a width, from one window to the next: they share two thirds of it
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What was measured of one data set, at rows STRIDE_S apart.
+    """What was measured of one data set, in windows that overlap.
 
     Attributes:
         position: Free coordinates, shape (k, m).
@@ -33,6 +35,8 @@ class Motion:
         acceleration: Shape (k, m).
         inputs: Averages, shape (k, nu).
         first: Rows with which a record begins, shape (k,).
+        stride: From one row of its record to the next, s, shape (k,).
+        spread: Noise of position, rate and acceleration that the encoders make, shape (k, 3 m).
         setup: The set-up.
         records: All samples, record by record.
     """
@@ -42,6 +46,8 @@ class Motion:
     acceleration: np.ndarray
     inputs: np.ndarray
     first: np.ndarray
+    stride: np.ndarray
+    spread: np.ndarray
     setup: Setup
     records: tuple[Samples, ...] = ()
 
@@ -69,34 +75,73 @@ def motion_of(
     count = len(body.coordinates)
     seen = data_set.outputs[:, :count]
     spacing = float(np.median(np.diff(data_set.time)))
-    half = max(LEAST_HALF_WIDTH, round(shorter * HALF_WIDTH_S / spacing))
     grid = np.arange(0.0, min(data_set.duration, longest), spacing)
-    if len(grid) <= 2 * half + 1:
-        return None
-    place, rate, acceleration = (_weights(half, spacing, order) for order in range(3))
-    held = _held(half, spacing)
-    stride = max(1, round(shorter * STRIDE_S / spacing))
+    half = _half(shorter * HALF_WIDTH_S, spacing)
     free = np.linalg.pinv(basis)
     angles = []
     for channel in seen.T:
         there = np.isfinite(channel)
-        if there.sum() <= 2 * half + 1:
+        if min(there.sum(), len(grid)) <= 2 * half + 1:
             return None
         angles.append(np.interp(grid, data_set.time[there], channel[there]))
     s = (np.column_stack(angles) - offset) @ free.T
+    sigma = np.sqrt(free**2 @ data_set.sigma[:count] ** 2)
+    if shorter == 1.0:
+        half = _as_noise_asks(half, s, sigma, spacing)
+    weights = [_weights(half, spacing, order) for order in range(3)]
+    held = _held(half, spacing)
+    stride = max(1, round(STRIDE * half))
     row = np.clip(np.searchsorted(data_set.time, grid, side='right') - 1, 0, None)
     inputs = data_set.inputs_for(names)[row]
 
-    def over(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        columns = [np.correlate(column, weights, 'valid')[::stride] for column in values.T]
-        return np.column_stack(columns)
+    def over(values: np.ndarray, own: np.ndarray) -> np.ndarray:
+        return np.column_stack([np.correlate(c, own, 'valid')[::stride] for c in values.T])
 
-    position = over(s, place)
+    position, rate, acceleration = (over(s, own) for own in weights)
+    k = len(position)
+    spread = np.concatenate([np.linalg.norm(own) * sigma for own in weights])
     return Motion(
-        position, over(s, rate), over(s, acceleration), over(inputs, held),
-        np.arange(len(position)) == 0, data_set.setup,
+        position, rate, acceleration, over(inputs, held), np.arange(k) == 0,
+        np.full(k, stride * spacing), np.tile(spread, (k, 1)), data_set.setup,
         (_samples(s, inputs, spacing, held, stride),),
     )  # fmt: skip
+
+
+def together(motions: Sequence[Motion]) -> Motion:
+    """Motions of one set-up, one after the other."""
+    rows = ('position', 'rate', 'acceleration', 'inputs', 'first', 'stride', 'spread')
+    joined = {name: np.concatenate([getattr(m, name) for m in motions]) for name in rows}
+    records = tuple(samples for motion in motions for samples in motion.records)
+    return Motion(**joined, setup=motions[0].setup, records=records)
+
+
+def _half(seconds: float, spacing: float) -> int:
+    return max(LEAST_HALF_WIDTH, round(seconds / spacing))
+
+
+def _as_noise_asks(half: int, s: np.ndarray, sigma: np.ndarray, spacing: float) -> int:
+    """Half a width, samples, with which noise is a small share of what the joints accelerate.
+
+    The noise of an acceleration falls with the power 5/2 of the width. A joint that stands still
+    does not count.
+
+    Args:
+        half: The usual one.
+        s: Free coordinates of all samples, shape (samples, m).
+        sigma: Noise of a sample, shape (m,).
+        spacing: Of the samples, s.
+    """
+    own = _weights(half, spacing, 2)
+    noise = np.linalg.norm(own) * sigma
+    squares = np.mean([np.correlate(column, own, 'valid') ** 2 for column in s.T], axis=1)
+    true = squares - noise**2
+    moves = true > noise**2
+    if not moves.any():
+        return half
+    share = float(np.max(noise[moves] / np.sqrt(true[moves])))
+    longer = float(np.clip((share / NOISY) ** 0.4, 1.0, LONGER))
+    most = max(half, (len(s) - 1) // 4)  # of a short record two windows are left
+    return min(round(longer * half), most)
 
 
 def _samples(
@@ -133,12 +178,3 @@ def _held(half: int, spacing: float) -> np.ndarray:
     summed = np.cumsum(np.cumsum(_weights(half, spacing, 2))) * spacing**2
     of_differences = np.concatenate([[0.0], summed[:-1], [0.0]])
     return (of_differences[:-1] + of_differences[1:]) / 2
-
-
-def noise_gains(spacing: float) -> tuple[float, float, float]:
-    """Noise of position, rate and acceleration over that of a sample, 1, 1/s and 1/s^2."""
-    half = max(LEAST_HALF_WIDTH, round(HALF_WIDTH_S / spacing))
-    place, rate, acceleration = (
-        float(np.linalg.norm(_weights(half, spacing, order))) for order in range(3)
-    )
-    return place, rate, acceleration

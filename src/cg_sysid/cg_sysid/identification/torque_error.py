@@ -35,12 +35,12 @@ from cg_sysid.identification.along_motion import AlongMotion
 from cg_sysid.identification.along_rows import AlongRows
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.hope import out_of_reach
-from cg_sysid.identification.measured_motion import Motion, motion_of
+from cg_sysid.identification.measured_motion import Motion, motion_of, together
 from cg_sysid.identification.student_t import deviance, row_scale, scale_of
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
 from cg_sysid.identification.window_torque import WindowTorque
 
-SHORTER = 0.5  # times that and STRIDE_S where a rotor moves by itself, which it does faster
+SHORTER = 0.5  # times the usual windows where a rotor moves by itself, which it does faster
 ENOUGH_S = 10.0  # of all records together, to be followed by a rotor
 ITERATIONS = 25
 HEAT = 6  # iterations from each of many starts, before the best of them go on
@@ -349,12 +349,7 @@ def problems_of(
         usable = [motion for motion in motions if motion is not None]
         if not usable:
             continue
-        every = Motion(
-            np.vstack([m.position for m in usable]), np.vstack([m.rate for m in usable]),
-            np.vstack([m.acceleration for m in usable]), np.vstack([m.inputs for m in usable]),
-            np.concatenate([m.first for m in usable]), setup,
-            tuple(samples for m in usable for samples in m.records),
-        )  # fmt: skip
+        every = together(usable)
         basis = np.asarray(plain.mechanism.kinematics(setup).basis)
         followed = tuple(
             AlongMotion(plain, effect, e.p, e.parameter_names, e.input_names, basis, every.records)
@@ -452,13 +447,32 @@ def residuals(
     return np.vstack([p.of_all(p.residual(_parameters(p, unknowns, theta))) for p in problems])
 
 
-def left_by(model: Model, data_sets: Sequence[DataSet]) -> list[np.ndarray]:
-    """(TE) of a model as it is along each record that can be used, as of `residuals`."""
-    found = []
+@dataclass(frozen=True)
+class Left:
+    """What a model leaves of the torques along one record.
+
+    Attributes:
+        error: (TE), N m (N), shape (rows, n), NaN of joints that a set-up locks.
+        stride: From one row to the next, s.
+    """
+
+    error: np.ndarray
+    stride: float
+
+
+def left_by(model: Model, data_sets: Sequence[DataSet]) -> list[Left]:
+    """(TE) of a model as it is along each record that can be used."""
+    found: list[Left] = []
     for p in problems_of(model, data_sets, ()):
         begins = np.flatnonzero(p.motion.first)
-        found += np.split(p.of_all(p.residual(p.vector)), begins[1:])
+        errors = np.split(p.of_all(p.residual(p.vector)), begins[1:])
+        found += map(Left, errors, p.motion.stride[begins].tolist())
     return found
+
+
+def all_rows(left: Sequence[Left]) -> np.ndarray:
+    """The errors of all records, shape (rows, n)."""
+    return np.vstack([one.error for one in left])
 
 
 def derivatives(

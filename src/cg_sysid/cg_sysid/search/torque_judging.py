@@ -14,14 +14,13 @@ from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
 from cg_sysid.identification.information_criterion import block_gain, independent_samples
-from cg_sysid.identification.measured_motion import STRIDE_S
 from cg_sysid.identification.student_t import (
     deviance_by_column,
     deviances,
     row_scale,
     scale_of,
 )
-from cg_sysid.identification.torque_error import TorqueFit
+from cg_sysid.identification.torque_error import Left, TorqueFit, all_rows
 from cg_sysid.identification.unknowns import IdentificationError, unknowns_of
 from cg_sysid.search import settings
 from cg_sysid.search.model_selection import block_s
@@ -67,14 +66,14 @@ class Fitted:
     Attributes:
         model: With the numbers of the file.
         said: The torque fit.
-        train: Torque errors of each record fitted to, shape (rows, n).
+        train: Of the torques of each record fitted to.
         held: The same of those held out.
     """
 
     model: Model
     said: TorqueFit
-    train: list[np.ndarray]
-    held: list[np.ndarray]
+    train: list[Left]
+    held: list[Left]
 
     @property
     def standing(self) -> Model:
@@ -83,8 +82,8 @@ class Fitted:
 
     def independent(self) -> tuple[np.ndarray, np.ndarray]:
         """Independent ones among the torques of the records fitted to: number and share, (n,)."""
-        weighted = [rows / row_scale(rows, self.said.scale) for rows in self.train]
-        steps = [STRIDE_S] * len(weighted)
+        weighted = [one.error / row_scale(one.error, self.said.scale) for one in self.train]
+        steps = [one.stride for one in self.train]
         number = np.array([
             independent_samples([rows[:, [k]] for rows in weighted], steps)
             for k in range(len(self.said.scale))
@@ -95,7 +94,7 @@ class Fitted:
     @property
     def deviance(self) -> np.ndarray:
         """(T) of the records fitted to, of each coordinate, (n,)."""
-        return deviance_by_column(np.vstack(self.train))
+        return deviance_by_column(all_rows(self.train))
 
     @property
     def disbelief(self) -> float:
@@ -200,11 +199,12 @@ class Judge:
         nats = gained + relieved - count / 2 * np.log(number.sum())
         # Rows in which friction turns are far off with any law: they count as (T) has it.
         before, after = (
-            [np.sqrt(deviances(rows, without.said.scale)) for rows in fitted.held]
+            [np.sqrt(deviances(one.error, without.said.scale)) for one in fitted.held]
             for fitted in (without, with_it)
         )
-        significance = block_gain(before, after, round(block_s(self.held) / STRIDE_S))
-        left, was = (scale_of(np.vstack(fitted.held)) for fitted in (with_it, without))
+        stride = float(np.median([one.stride for one in without.held]))
+        significance = block_gain(before, after, round(block_s(self.held) / stride))
+        left, was = (scale_of(all_rows(fitted.held)) for fitted in (with_it, without))
         return Gain(float(nats), significance, 1 - (left / was) ** 2, float(relieved))
 
     def _at_edge(self, fitted: Fitted, label: str) -> dict[str, tuple[float, str]]:
@@ -218,7 +218,7 @@ class Judge:
         unknowns = tuple(u for u in unknowns_of(fitted.model) if u.name in values)
         problems = torque_error.problems_of(fitted.model, self.train, unknowns)
         theta = np.array([u.to_coordinate(values[u.name]) for u in unknowns])
-        scale = np.nan_to_num(row_scale(np.vstack(fitted.train), fitted.said.scale), nan=1.0)
+        scale = np.nan_to_num(row_scale(all_rows(fitted.train), fitted.said.scale), nan=1.0)
         _, share = fitted.independent()
         j = torque_error.derivatives(problems, unknowns, theta) / scale[:, :, None]
         j = (np.sqrt(share)[:, None] * j).reshape(-1, len(unknowns))

@@ -36,7 +36,7 @@ from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.along_motion import Samples
 from cg_sysid.identification.data_set import DataSet
-from cg_sysid.identification.measured_motion import STRIDE_S, Motion, noise_gains
+from cg_sysid.identification.measured_motion import Motion
 from cg_sysid.identification.student_t import row_scale, spread_of
 from cg_sysid.identification.torque_error import Problem, TorqueFit
 from cg_sysid.identification.unknowns import Unknown, unknowns_of
@@ -58,8 +58,8 @@ AT_NOISE = 1.3  # times what the noise of the encoders makes: up to here torques
 HINT = 1.0  # nats, from which a candidate then gets a look
 WORST = 2  # joints on which effects with states are looked at
 LOSS = 'viscous_friction'  # of which a simulation of seconds tells more than torques do
-PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s
-BLOCK = 12  # rows, 0.5 s
+PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s, twice that of coarse encoders
+BLOCK = 12  # rows, 0.5 s, or twice that
 QUIET = 0.9  # share of the blocks at least in which nobody pushes
 SLOW = 0.1  # of the usual rate of a joint
 BEGINS = 3  # rows, as long as the window of a local polynomial
@@ -172,7 +172,7 @@ def scores(
     tests = {c: s for c in candidates if (s := base.score_tests(*c, starts[c])) is not None}
     gains = {c: max(0.0, *of_starts) for c, of_starts in tests.items()}
     joints = model.mechanism.coordinates
-    noise = _noise(train[0], base.problems, base.by_motion)
+    noise = _noise(base.problems, base.by_motion)
     order = np.argsort(-base.fitted.rms / np.maximum(noise, 1e-12))
     worst = _worst([joints[k] for k in order], missed or {})
     follow = followed({c: gain for c, gain in gains.items() if not _sensed(c[0])})
@@ -615,7 +615,7 @@ def _one_column(
 
 def _rise(values: np.ndarray, motion: Motion) -> np.ndarray:
     """Derivative by time along rows, where they follow each other."""
-    rise = np.gradient(values, STRIDE_S, axis=0)
+    rise = np.gradient(values, np.cumsum(motion.stride), axis=0)
     rise[motion.first] = 0.0
     rise[:-1][motion.first[1:]] = 0.0
     return rise
@@ -637,17 +637,12 @@ def _by_motion(problem: Problem, model: Model) -> np.ndarray:
     return found.reshape(m, k, 3 * m).transpose(1, 0, 2)
 
 
-def _noise(
-    data_set: DataSet, problems: Sequence[Problem], by_motion: Sequence[np.ndarray]
-) -> np.ndarray:
+def _noise(problems: Sequence[Problem], by_motion: Sequence[np.ndarray]) -> np.ndarray:
     """Torque error that the noise of the encoders makes, for each coordinate, N m (N)."""
-    spacing = float(np.median(np.diff(data_set.time)))
-    gains = noise_gains(spacing)
     squares = []
     for problem, slope in zip(problems, by_motion, strict=True):
-        sigma = data_set.sigma[: len(problem.free)][problem.free]
-        spread = np.concatenate([gain * sigma for gain in gains])
-        squares.append(problem.of_all(slope**2 @ spread**2, 0.0))
+        made = np.einsum('kij,kj->ki', slope**2, problem.motion.spread**2)
+        squares.append(problem.of_all(made, 0.0))
     return np.sqrt(np.mean(np.vstack(squares), axis=0))
 
 
