@@ -7,7 +7,13 @@ import pytest
 from hanging_arm import SAMPLE, nominal, recorded
 
 from cg_sysid.identification.data_set import DataSet, prepare
-from cg_sysid.identification.measured_motion import HALF_WIDTH_S, LONGER, NOISY, motion_of, together
+from cg_sysid.identification.measured_motion import (
+    HALF_WIDTH_S,
+    LONGER,
+    NOISY,
+    motion_of,
+    together,
+)
 
 NOISE = np.array([8e-5, 2e-4, 1.2e-4])  # rad
 DRAWS = 40

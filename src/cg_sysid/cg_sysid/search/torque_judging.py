@@ -128,8 +128,13 @@ class Gain:
 
     @property
     def significant(self) -> bool:
-        """Whether records held out gain."""
-        return self.significance >= (0.0 if self.relieves else settings.SELECTION.significant)
+        """Whether records held out gain.
+
+        By what only takes the place of numbers that nobody believes they gain nothing: they must
+        not lose.
+        """
+        needed = settings.SELECTION.significant
+        return self.significance >= (-needed if self.relieves else needed)
 
 
 @dataclass(frozen=True)
