@@ -66,6 +66,15 @@ def test_only_a_number_that_ends_at_nothing_turns_an_effect(search):
         assert (turned and turned[0]) == simpler
 
 
+@MOST
+def test_what_the_machine_has_already_comes_not_twice(search):
+    _, rich = search
+    model = rich.train.model.with_values({f'{WITH_SHARE}.share': 0.0})
+    both = rich.model.with_effect(WITHOUT, **DRIVE)
+    o = replace(rich, model=both, train=replace(rich.train, model=model))
+    assert turned_into(o, WITH_SHARE) is None
+
+
 @NONE
 def test_its_evidence_is_that_of_the_richer_one(search):
     work, rich = search

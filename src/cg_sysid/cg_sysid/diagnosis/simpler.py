@@ -40,7 +40,7 @@ def turned_into(o: Outcome, label: str) -> tuple[str, Model] | None:
     """Label of the simpler effect that a cause is, as its numbers stand, and the model with it.
 
     None where no number of it is nothing to within its uncertainty, or no effect has just the
-    others.
+    others, or the model has that effect already.
     """
     effect, sure = o.model.effect(label), parameters_of(o, label)
     values = {p.name: o.train.model.values[f'{label}.{p.name}'] for p in effect.parameters}
@@ -48,9 +48,12 @@ def turned_into(o: Outcome, label: str) -> tuple[str, Model] | None:
         p.name for p in effect.parameters if 'lower' in p.ends and p.name in sure
         and values[p.name] - p.lower <= settings.SELECTION.too_small * sure[p.name][1]
     }  # fmt: skip
+    left = {n: v for n, v in values.items() if n not in gone}
+    without = o.model.without_effect(label)
     for name in effect.contains if gone else ():
-        if {p.name for p in LIBRARY[name].parameters} == values.keys() - gone:
-            left = {n: v for n, v in values.items() if n not in gone}
-            model = o.model.without_effect(label).with_effect(name, at=effect.at, **left)
-            return model.effects[-1].label, model
+        simpler = LIBRARY[name](without.mechanism, effect.at).label
+        if simpler in (other.label for other in without.effects):
+            continue
+        if {p.name for p in LIBRARY[name].parameters} == left.keys():
+            return simpler, without.with_effect(name, at=effect.at, **left)
     return None
