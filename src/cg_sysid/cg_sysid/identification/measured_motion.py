@@ -65,7 +65,7 @@ def motion_of(
         model: Its mechanism counts.
         data_set: The record.
         names: Inputs wanted.
-        shorter: Times the usual windows.
+        shorter: Times the usual windows; with 1 they are as long as the noise asks.
         longest: Only so much of the record, s.
     """
     body = model.mechanism
