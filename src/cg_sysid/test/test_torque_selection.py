@@ -16,7 +16,7 @@ from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.identification.torque_error import fit_by_torque
 from cg_sysid.identification.unknowns import IdentificationError
 from cg_sysid.records.bags import write_bag
-from cg_sysid.search import torque_selection
+from cg_sysid.search import torque_search
 from cg_sysid.search.torque_screening import scores
 from cg_sysid.search.torque_selection import select
 
@@ -83,7 +83,7 @@ def test_what_all_joints_lack_is_taken_up_at_once(believed, monkeypatch):
         hidden.append(('rotor_inertia', joint, {'inertia': inertia}))
     looks = []
     monkeypatch.setattr(
-        torque_selection, 'scores', lambda *a, **k: looks.append(a) or scores(*a, **k)
+        torque_search, 'scores', lambda *a, **k: looks.append(a) or scores(*a, **k)
     )
     found = select(bare, *ways(machine(believed, *hidden), bare))
     sizes = {law.label: next(iter(law.parameters.values()))[0] for law in found.laws}
@@ -119,6 +119,53 @@ def test_a_stribeck_curve_is_told_where_dry_friction_seems_to_stay():
     }
     alone = select(bare, data_sets[0::2], data_sets[1::2], asked_for[:3])
     assert 'stribeck_friction@slide' not in {law.label for law in alone.laws}
+
+
+def selected_of_rides(bare, true, names):
+    data_sets = prepare(bare, [ride(true, k) for k in range(4)])
+    found = select(bare, data_sets[0::2], data_sets[1::2], names)
+    return {law.label: [value for value, _, _ in law.parameters.values()] for law in found.laws}
+
+
+def test_two_are_taken_up_at_once_where_neither_is_worth_it_alone():
+    """What a slope leaves is constant, so that nothing in it is independent."""
+    bare = Model.from_text(CART_POLE).without_effect('viscous_friction@slide')
+    true = bare.with_effect('viscous_friction', 'slide', coefficient=3.0)
+    true = true.with_effect('coulomb_friction', 'slide', torque=0.6)
+    true = true.with_effect('ground_slope', x=0.0, y=0.012)
+    sizes = selected_of_rides(
+        bare, true, ['viscous_friction', 'coulomb_friction', 'ground_slope']
+    )  # fmt: skip
+    _, about_y = sizes.pop('ground_slope')  # nothing on a rail along x turns about x
+    assert about_y == pytest.approx(0.012, rel=0.05)
+    assert sizes == {
+        'viscous_friction@slide': pytest.approx([3.0], rel=0.02),
+        'coulomb_friction@slide': pytest.approx([0.6], rel=0.02),
+    }
+
+
+def test_friction_one_way_only_is_a_constant_beside_friction_both_ways():
+    bare = Model.from_text(CART_POLE).without_effect('viscous_friction@slide')
+    true = bare.with_effect('coulomb_friction', 'slide', torque=0.6)
+    true = true.with_effect('torque_bias', bias=-0.6)
+    names = ['coulomb_friction', 'viscous_friction', 'asymmetric_friction', 'torque_bias']
+    assert selected_of_rides(bare, true, names) == {
+        'coulomb_friction@slide': pytest.approx([0.6], rel=0.02),
+        'torque_bias': pytest.approx([-0.6], rel=0.02),
+    }
+
+
+def test_a_joint_whose_friction_is_of_another_kind_than_the_others_has_that():
+    """Dry friction is taken up at all joints at once; what little a pivot has fits both."""
+    bare = Model.from_text(CART_POLE)
+    for joint in 'slide', 'pivot':
+        bare = bare.without_effect(f'viscous_friction@{joint}')
+    true = bare.with_effect('coulomb_friction', 'slide', torque=1.5)
+    true = true.with_effect('viscous_friction', 'pivot', coefficient=0.001)
+    assert selected_of_rides(bare, true, ['coulomb_friction', 'viscous_friction']) == {
+        'coulomb_friction@slide': pytest.approx([1.5], rel=0.02),
+        'viscous_friction@pivot': pytest.approx([0.001], rel=0.2),  # noise: 10 %
+    }
 
 
 def test_of_laws_that_leave_the_same_the_simplest_is_taken_up(believed):

@@ -191,6 +191,11 @@ class Effect:
         return self.parameters
 
     @property
+    def sizes(self) -> tuple[Parameter, ...]:
+        """Parameters that say how much of it there is: it is none where all of these are."""
+        return self.parameters[:1]
+
+    @property
     def label(self) -> str:
         """Name within a model: the standard name, and the place where it is not the usual one."""
         return self.name if self.at is None else f'{self.name}@{self.at}'

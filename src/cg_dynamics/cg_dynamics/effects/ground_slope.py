@@ -40,6 +40,11 @@ class GroundSlope(Effect):
         """In space the base can be tilted about two axes."""
         return self.parameters if mechanism.dimensions == 2 else TILT
 
+    @property
+    def sizes(self):
+        """All of its angles."""
+        return self.parameters
+
     def acts(self, values):
         """Where any of its angles is not 0."""
         return any(values.values())

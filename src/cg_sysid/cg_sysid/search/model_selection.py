@@ -24,6 +24,7 @@ from cg_sysid.search.outcome import (
     own_parameters,
     prior_conflicts,
     shared_unknowns,
+    sizes_of,
     too_small,
     undetermined_size,
 )
@@ -397,9 +398,10 @@ def within_friction(o: Outcome) -> list[str]:
 
 
 def _known_at_all(o: Outcome) -> bool:
-    """Whether the first parameter of an effect, its size, exceeds its standard deviation."""
-    size, sigma, _ = next(iter(own_parameters(o).values()), (0.0, np.inf, ''))
-    return abs(size) > sigma
+    """Whether a size of an effect exceeds its standard deviation."""
+    own = own_parameters(o)
+    return any(abs(own[size.name][0]) > own[size.name][1]
+               for size in sizes_of(o) if size.name in own)  # fmt: skip
 
 
 def above_noise(o: Outcome) -> float:

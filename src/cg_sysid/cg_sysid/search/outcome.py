@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cg_dynamics.effects import LIBRARY
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_dynamics.parameter import Parameter
 from cg_sysid.identification.fit_result import Fit
@@ -167,23 +168,31 @@ def shared_unknowns(found: Fit, bounds: Bounds) -> float:
     return float(counted.sum() - (unsure - were_they_known).sum())
 
 
-def _declared_by(o: Outcome) -> tuple[Parameter, ...]:
-    """Parameters of the effect that an outcome is of; none where it is of a model alone."""
-    found = (e.parameters for e in o.model.effects if e.label == o.label and e.name in LIBRARY)
-    return next(found, ())
+def _effect_of(o: Outcome) -> Effect | None:
+    """The effect that an outcome is of; None where it is of a model alone."""
+    found = (e for e in o.model.effects if e.label == o.label and e.name in LIBRARY)
+    return next(found, None)
+
+
+def sizes_of(o: Outcome) -> tuple[Parameter, ...]:
+    """The parameters that say how much there is of the effect that an outcome is of."""
+    effect = _effect_of(o)
+    return effect.sizes if effect else ()
 
 
 def too_small(o: Outcome) -> list[str]:
     """An effect whose size is as good as none is not what helped."""
-    first = next(iter(_declared_by(o)), None)
-    if first is None or first.neutral is None or not np.isfinite(first.neutral) or first.each:
-        return []
-    value, sigma, unit = parameters_of(o, o.label).get(first.name, (np.inf, 0.0, ''))
-    # Within their bounds small faults may take any part of it: that says nothing of its size.
-    beside = _sigma_beside(o.train, f'{o.label}.{first.name}', o.task.bounds)
-    if abs(value - first.neutral) > settings.SELECTION.too_small * min(sigma, beside):
-        return []
-    return [f'{first.name} = {measured(value, sigma, unit)} is as good as none']
+    said = []
+    for size in sizes_of(o):
+        if size.neutral is None or not np.isfinite(size.neutral) or size.each:
+            return []
+        value, sigma, unit = parameters_of(o, o.label).get(size.name, (np.inf, 0.0, ''))
+        # Within their bounds small faults may take any part of it: that says nothing of its size.
+        beside = _sigma_beside(o.train, f'{o.label}.{size.name}', o.task.bounds)
+        if abs(value - size.neutral) > settings.SELECTION.too_small * min(sigma, beside):
+            return []
+        said.append(f'{size.name} = {measured(value, sigma, unit)}')
+    return [f'{" and ".join(said)} is as good as none'] if said else []
 
 
 def undetermined_size(o: Outcome) -> list[str]:
@@ -191,10 +200,11 @@ def undetermined_size(o: Outcome) -> list[str]:
 
     A limit that was never reached, a stiffness that nothing bends: what acts is something else.
     """
-    name = next((p.name for p in _declared_by(o)), '')
-    if f'{o.label}.{name}' not in o.train.undetermined:
+    names = [size.name for size in sizes_of(o)]
+    if not names or not all(f'{o.label}.{name}' in o.train.undetermined for name in names):
         return []
-    return [f'{name} = {measured(*parameters_of(o, o.label)[name])} is not determined']
+    said = [f'{name} = {measured(*parameters_of(o, o.label)[name])}' for name in names]
+    return [f'{" and ".join(said)} is not determined']
 
 
 def _sigma_beside(found: Fit, name: str, given: Collection[str]) -> float:
@@ -226,9 +236,11 @@ def edges_in_words(label: str, at_edge: Mapping[str, tuple[float, str]]) -> list
 
 def parameters_at_edge(o: Outcome) -> dict[str, tuple[float, str]]:
     """Those of an outcome's effect, with value and unit; small faults have no such edge."""
-    fitted = zip(o.train.unknowns, o.train.values, strict=True)
+    fitted, effect = zip(o.train.unknowns, o.train.values, strict=True), _effect_of(o)
     return edges(
-        o.label, _declared_by(o), [(u, v) for u, v in fitted if u.name not in o.task.bounds]
+        o.label,
+        effect.parameters if effect else (),
+        [(u, v) for u, v in fitted if u.name not in o.task.bounds],
     )
 
 

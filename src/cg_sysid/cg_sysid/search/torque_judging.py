@@ -4,12 +4,12 @@ A structure is fitted by torques to some records and judged by others (diagnosis
 Numbers are told with standard deviations by the curvature of (T) and by belief.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from cg_dynamics.effects.effect import Effect
 from cg_dynamics.model import Model
 from cg_sysid.identification import torque_error
 from cg_sysid.identification.data_set import DataSet
@@ -28,7 +28,7 @@ from cg_sysid.search.outcome import edges, edges_in_words
 from cg_sysid.text import measured
 
 MATERIAL = 0.1  # of the squared torque error of one joint, held out, that an effect takes at least
-EVERY_JOINT = 'viscous_friction', 'coulomb_friction'  # has them: a little is no surprise
+EVERY_JOINT = 'viscous_friction', 'coulomb_friction'  # has them
 LOST = 1e-12  # of a curvature beside the steepest: nothing is known there
 
 Sizes = Mapping[str, tuple[float, float, str]]
@@ -182,12 +182,12 @@ class Judge:
             label: Its label.
             independent: Number and share of independent torques, of who leads (independent()).
         """
-        sizes = self.sizes(with_it, label)
-        gain = self.gain(without, with_it, len(sizes), independent)
-        expected = with_it.model.effect(label).name in EVERY_JOINT
-        reasons = _shortcomings(gain, sizes, expected)
+        effect, known = with_it.model.effect(label), self.sizes(with_it, label)
+        gain = self.gain(without, with_it, len(known), independent)
+        how_much = {size.name: known[size.name] for size in effect.sizes if size.name in known}
+        reasons = _shortcomings(gain, how_much, at_every_joint(effect))
         reasons += edges_in_words(label, self._at_edge(with_it, label))
-        return Law(label, gain.nats, gain.significance, gain.taken, sizes, gain.relieves,
+        return Law(label, gain.nats, gain.significance, gain.taken, known, gain.relieves,
                    reason='; '.join(reasons))  # fmt: skip
 
     def gain(
@@ -241,6 +241,11 @@ class Judge:
         }  # fmt: skip
 
 
+def at_every_joint(effect: Effect) -> bool:
+    """Whether every joint has some of it, so that a little is no surprise."""
+    return effect.name in EVERY_JOINT
+
+
 def _shortcomings(gain: Gain, sizes: Sizes, expected: bool) -> list[str]:
     """Why what an effect gains is not worth it."""
     found = []
@@ -250,7 +255,8 @@ def _shortcomings(gain: Gain, sizes: Sizes, expected: bool) -> list[str]:
         found.append('no significant gain on recordings held out')
     if np.nanmax(gain.taken) < MATERIAL and not (gain.relieves or expected):
         found.append(f'takes less than {MATERIAL:.0%} of the squared error of any joint')
-    for name, (size, sigma, unit) in itertools.islice(sizes.items(), 1):
-        if abs(size) < settings.SELECTION.too_small * sigma:
-            found.append(f'{name} = {measured(size, sigma, unit)} may be none')
+    small = settings.SELECTION.too_small
+    if sizes and all(abs(size) < small * sigma for size, sigma, _ in sizes.values()):
+        said = [f'{name} = {measured(*size)}' for name, size in sizes.items()]
+        found.append(f'{" and ".join(said)} may be none')
     return found

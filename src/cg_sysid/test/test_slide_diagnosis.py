@@ -1,0 +1,19 @@
+"""A cart on a rail that is not level: one of the slope's two angles says nothing there."""
+
+import pytest
+from slide import CART_POLE, ride
+
+from cg_dynamics.model import Model
+from cg_sysid.diagnosis.diagnose import Options, diagnose
+
+
+def test_a_slope_along_a_rail_is_named_though_nothing_is_known_across_it():
+    level = Model.from_text(CART_POLE)
+    tilted = level.with_effect('ground_slope', x=0.0, y=0.012)
+    found = diagnose(
+        level, [ride(tilted, k) for k in range(2)], Options(effects=['ground_slope'], workers=1)
+    )
+    (cause,) = found.causes
+    assert cause.label == 'ground_slope'
+    about_y, sigma, _ = cause.parameters['y']
+    assert about_y == pytest.approx(0.012, abs=4 * sigma)
