@@ -198,6 +198,15 @@ def test_a_law_of_torque_that_gains_most_drives_out_no_delay_and_no_sensor():
     assert found.worth(list(gains)) == [constant, late, bent]
 
 
+def test_a_slope_gets_a_look_where_a_joint_moves_that_nothing_drives():
+    """Torques take it for a constant of the drive, and deny it beside that."""
+    slope, load = ('ground_slope', None), ('payload', 'pole')
+    gains = {slope: 0.0, load: 50.0}
+    for passive, looked_at in ((True, [slope, load]), (False, [load])):
+        found = Scores(gains, {load: 50.0}, ('slide',), passive=passive)
+        assert found.worth([slope, load]) == looked_at
+
+
 @pytest.mark.parametrize(('joints', 'looks'), [(2, 16), (3, 10), (6, KEPT)])
 def test_of_few_joints_more_candidates_are_looked_at(joints, looks):
     names = tuple(f'joint_{k}' for k in range(joints))

@@ -58,6 +58,7 @@ AT_NOISE = 1.3  # times what the noise of the encoders makes: up to here torques
 HINT = 1.0  # nats, from which a candidate then gets a look
 WORST = 2  # joints on which effects with states are looked at
 LOSS = 'viscous_friction'  # of which a simulation of seconds tells more than torques do
+TILT = 'ground_slope'  # the same of joints that nothing drives
 PULSES = 1, 2, 4  # rows that a push may last: 0.04 to 0.16 s, twice that of coarse encoders
 BLOCK = 12  # rows, 0.5 s, or twice that
 QUIET = 0.9  # share of the blocks at least in which nobody pushes
@@ -78,6 +79,7 @@ class Scores:
         pushed: What pushes once, where it may have: (effect, place).
         extended: The base with each of `fitted` where it has a fit, at its start, and that fit.
         at_noise: Whether the torque errors of the base are no more than encoders make of theirs.
+        passive: Whether a joint moves that nothing drives.
     """
 
     gains: dict[EffectAt, float]
@@ -86,6 +88,7 @@ class Scores:
     pushed: tuple[EffectAt, ...] = ()
     extended: dict[EffectAt, tuple[Model, TorqueFit]] = field(default_factory=dict)
     at_noise: bool = False
+    passive: bool = False
 
     def worth(self, candidates: Sequence[EffectAt]) -> list[EffectAt]:
         """Those to be looked at."""
@@ -115,6 +118,8 @@ class Scores:
         }
         # What a joint loses in each swing adds up in a simulation, and drowns in noisy rates here.
         unseen |= {c for c in candidates if c[0] == LOSS and _on_worst(*c, self.worst)}
+        # Where a joint comes to rest that nothing drives shows at once, in no torque.
+        unseen |= {c for c in candidates if c[0] == TILT and self.passive}
         # Smoothed torques know little of delays: they wait beside what gains far more only.
         unseen |= {
             c for c in candidates if _late(c[0]) and not self.gains.get(c, np.inf) < LATE * best
@@ -196,7 +201,8 @@ def scores(
     pushers = [c for c in candidates if _happens(c[0])]
     pushed = base.pushed(pushers, [*train, *held]) if pushers else ()
     at_noise = bool((np.nan_to_num(base.fitted.scale) < AT_NOISE * noise).all())
-    return Scores(gains, by_fit, worst, pushed, extended, at_noise)
+    passive = not set(joints) <= {*model.mechanism.driven}
+    return Scores(gains, by_fit, worst, pushed, extended, at_noise, passive)
 
 
 @dataclass(frozen=True)
