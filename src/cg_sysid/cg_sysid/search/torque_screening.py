@@ -79,7 +79,7 @@ class Scores:
         pushed: What pushes once, where it may have: (effect, place).
         extended: The base with each of `fitted` where it has a fit, at its start, and that fit.
         at_noise: Whether the torque errors of the base are no more than encoders make of theirs.
-        passive: Whether a joint moves that nothing drives.
+        passive: Whether a joint moves that no drive turns directly.
     """
 
     gains: dict[EffectAt, float]
@@ -201,7 +201,7 @@ def scores(
     pushers = [c for c in candidates if _happens(c[0])]
     pushed = base.pushed(pushers, [*train, *held]) if pushers else ()
     at_noise = bool((np.nan_to_num(base.fitted.scale) < AT_NOISE * noise).all())
-    passive = not set(joints) <= {*model.mechanism.driven}
+    passive = not set(model.mechanism.all_joints) <= set(model.mechanism.joints)
     return Scores(gains, by_fit, worst, pushed, extended, at_noise, passive)
 
 
