@@ -15,9 +15,13 @@ from cg_sysid.identification.data_set import prepare
 from cg_sysid.identification.joint_friction import friction_of
 from cg_sysid.identification.torque_error import fit_by_torque
 from cg_sysid.identification.unknowns import IdentificationError
+from cg_sysid.parallel import one_by_one
 from cg_sysid.records.bags import write_bag
 from cg_sysid.search import torque_search
+from cg_sysid.search.torque_alternatives import with_likes
+from cg_sysid.search.torque_judging import Judge
 from cg_sysid.search.torque_screening import scores
+from cg_sysid.search.torque_search import TorqueSearch
 from cg_sysid.search.torque_selection import select
 
 OFF = {
@@ -166,6 +170,28 @@ def test_a_joint_whose_friction_is_of_another_kind_than_the_others_has_that():
         'coulomb_friction@slide': pytest.approx([1.5], rel=0.02),
         'viscous_friction@pivot': pytest.approx([0.001], rel=0.2),  # noise: 10 %
     }
+
+
+@pytest.mark.parametrize('label', ['coulomb_friction@slide', 'friction_drift@slide'])
+def test_friction_that_fades_for_minutes_gives_way_to_friction_that_stays(label):
+    bare = Model.from_text(CART_POLE)
+    drift = {'excess': 0.6, 'time_constant': 2.0}
+    sizes = {'coulomb_friction': {'torque': 0.6}, 'friction_drift': drift}
+    name, at = label.split('@')
+    data_sets = prepare(bare, [ride(bare.with_effect(name, at, **sizes[name]), k) for k in (0, 1)])
+    judge = Judge(data_sets[:1], data_sets[1:])
+    search = TorqueSearch(judge, ['coulomb_friction', 'friction_drift'], one_by_one)
+    start = {'friction_drift@slide.time_constant': 100.0} if name != 'friction_drift' else {}
+    base = judge.fit(bare.with_effect('friction_drift', at, **drift), start)
+    none = judge.fit(bare, {})
+    drifts = judge.law(none, base, 'friction_drift@slide', base.independent())
+    found = with_likes(search, base, [drifts])
+    if label == 'friction_drift@slide':
+        assert found is None
+    else:
+        ((law,), fitted) = found
+        assert law.label == label
+        assert fitted.said.values[f'{label}.torque'] == pytest.approx(0.6, rel=0.02)
 
 
 def test_of_laws_that_leave_the_same_the_simplest_is_taken_up(believed):

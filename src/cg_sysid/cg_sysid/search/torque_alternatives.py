@@ -25,6 +25,7 @@ LIKE = {
     'coulomb_friction': (('viscous_friction',),),
     'viscous_friction': (('coulomb_friction',),),
     RISES: (('viscous_friction',), ('coulomb_friction',)),
+    'friction_drift': (('coulomb_friction',),),  # which one that takes minutes is
     # One way there would be none: it is as much both ways, beside a constant.
     'asymmetric_friction': (('coulomb_friction', 'torque_bias'),),
 }  # friction -> what may be meant by it at the same joint
@@ -132,7 +133,7 @@ def with_likes(
 
     What every joint lacks was taken up at all of them at once, and what came later may have
     hidden the law of one. What every joint has takes the place of what few have where the
-    torques cannot tell.
+    torques cannot tell, and what is simpler that of what does not earn its numbers beside it.
 
     Returns:
         The laws and the base with another law; None where none does better.
@@ -149,11 +150,8 @@ def with_likes(
     for (law, model, count), fit in zip(trials, said, strict=True):
         there = search.judge.with_errors(model, fit)
         independent = min((base, there), key=lambda f: f.said.deviance).independent()
-        # As many numbers, or what every joint has besides, which needs no evidence.
-        gain = search.judge.gain(base, there, 0, independent)
-        rare = not at_every_joint(base.model.effect(law.label))
-        nats = gain.nats + (settings.SELECTION.margin if rare else 0.0)
-        if nats > most and gain.significance > -settings.SELECTION.significant:
+        nats = _advantage(search, base, there, law, independent)
+        if nats > most:
             more = [
                 search.judge.law(base, there, effect.label, independent)
                 for effect in model.effects[-count:]
@@ -161,6 +159,26 @@ def with_likes(
             rest = [other for other in laws if other is not law]
             best, most = ([*rest, *more], there), nats
     return best
+
+
+def _advantage(
+    search: TorqueSearch,
+    base: Fitted,
+    there: Fitted,
+    law: Law,
+    independent: tuple[np.ndarray, np.ndarray],
+) -> float:
+    """Nats for what is like a law of the base; none where it should not take its place."""
+    rare = not at_every_joint(base.model.effect(law.label))
+    spared = len(base.said.values) - len(there.said.values)
+    if rare and spared > 0:
+        surplus = search.judge.gain(there, base, spared, independent)
+        earned = surplus.nats >= settings.SELECTION.earned and surplus.significant
+        return 0.0 if earned else settings.SELECTION.margin
+    # As many numbers, or what every joint has besides, which needs no evidence.
+    gain = search.judge.gain(base, there, 0, independent)
+    lost = gain.significance <= -settings.SELECTION.significant
+    return 0.0 if lost else gain.nats + (settings.SELECTION.margin if rare else 0.0)
 
 
 def _alike(

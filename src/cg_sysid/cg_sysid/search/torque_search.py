@@ -21,7 +21,13 @@ EVERY_DRIVE = *EVERY_JOINT, 'rotor_inertia'  # has some of these
 
 @dataclass(frozen=True)
 class TorqueSearch:
-    """Effects, sought on one split of the records."""
+    """Effects, sought on one split of the records.
+
+    Attributes:
+        judge: Of what is fitted to some records by others.
+        names: Effects, or labels of effects, that may be taken up; None for the whole library.
+        carry_out: Who fits.
+    """
 
     judge: Judge
     names: Sequence[str] | None
