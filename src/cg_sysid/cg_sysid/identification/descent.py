@@ -20,6 +20,7 @@ from cg_sysid.identification.simulation_error import (
     moved,
     reduced,
     settled,
+    without_unnoticed,
 )
 
 SMALL_GAIN = 0.1  # squared standard deviations: nobody would call one fit better than another
@@ -94,7 +95,7 @@ def minimise(
         iterations: At most.
         drift: Relative change of the cost at which this has converged.
         reach: chi2/N that matters, as of `identify.fit`.
-        leading: Unknowns that this horizon does not notice stay where they are.
+        leading: What this horizon does not notice stays where it is, such as a late push.
         valley: How far steps may leave its floor.
         damping: Of the first step.
         trial: The start, where it has been simulated already.
@@ -138,7 +139,7 @@ class _Way:
         self._leading, self._valley, self._kept = leading, valley, kept
         ends = np.array([u.ends for u in problem.unknowns]).reshape(-1, 2)
         self._lower, self._upper = ends.T
-        point = start.point(weight)
+        point = self._of_steps(start.point(weight))
         assert point is not None
         self._here, self._theta, self._motions, self._damping = start, theta, motions, damping
         self._too_long = False  # whether a step was
@@ -250,8 +251,14 @@ class _Way:
 
     def _normal(self, trial: Trial | None) -> Point | None:
         """Its normal equations; None where there are none."""
-        there = None if trial is None else trial.point(self._weight)
+        there = self._of_steps(None if trial is None else trial.point(self._weight))
         return None if there is None else there.beside(BARRIER, self._barrier)
+
+    def _of_steps(self, point: Point | None) -> Point | None:
+        """A point as the steps of this search have it."""
+        if point is None or not (self._leading and self._problem.own):
+            return point
+        return without_unnoticed(self._problem, point, self._weight)
 
 
 def error_of(point: Point) -> float:

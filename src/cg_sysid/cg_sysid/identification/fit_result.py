@@ -80,11 +80,11 @@ class Fit:
         )
 
     def own_by_name(self, data_sets: Sequence[DataSet]) -> dict[str, dict[str, float]]:
-        """What was found of each data set alone: its name -> full name -> value."""
+        """What was found of each data set alone: its name -> full name -> value, within range."""
         count = len(self.own)
         return {
             data_set.name: {
-                u.name: float(v)
+                u.name: float(np.clip(v, u.lower, u.upper))
                 for u, v in zip(self.own, motion[len(motion) - count :], strict=True)
             }
             for data_set, motion in zip(data_sets, self.motions, strict=True)

@@ -498,6 +498,26 @@ def reduced(point: Point, damping: float) -> tuple[np.ndarray, np.ndarray, list]
     return h, g, factors
 
 
+def without_unnoticed(problem: Problem, point: Point, weight: float) -> Point:
+    """A point from which no step moves what a data set has of its own and does not notice.
+
+    A push that comes after the horizon is such. Steps are as long as a direction is flat, and that
+    one, flat but for a tail of the push, would lead a long way off.
+    """
+    scales = np.array([u.scale for u in problem.own])
+    blocks = []
+    for block, (curvature, coupling, gradient) in zip(problem.blocks, point.own, strict=True):
+        at = np.array([place[len(place) - len(scales) :] for place in block.places], int)
+        unnoticed = np.unique(at[np.diag(curvature)[at] * scales**2 < weight])
+        steep = np.diag(curvature)[unnoticed]
+        curvature, coupling, gradient = curvature.copy(), coupling.copy(), gradient.copy()
+        curvature[unnoticed] = curvature[:, unnoticed] = 0.0
+        curvature[unnoticed, unnoticed] = steep
+        coupling[unnoticed], gradient[unnoticed] = 0.0, 0.0
+        blocks.append((curvature, coupling, gradient))
+    return replace(point, own=blocks)
+
+
 def solve(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The x of a x = b for a curvature a; directions lost beside far steeper ones stay."""
     # Where sensitivities run away a small curvature is lost in rounding, and may be below nothing.

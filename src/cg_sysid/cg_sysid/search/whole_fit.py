@@ -35,11 +35,13 @@ def try_candidate(
         known: Mapping[str, Mapping[str, float]] = {
             t.name: task.events[t.name] for t in held if t.name in task.events
         }
-        if eventful(task):
-            known = seek_events(best.model, held, label, known, _surest(best, label))
         unseen = _unseen_shapes(best)
+        judged = best.model
+        if eventful(task):
+            judged = _with_shapes_of(judged, next(starting_models(task)), unseen)
+            known = seek_events(judged, held, label, known, _surest(best, label))
         held_score = score(
-            best.model, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
+            judged, held, unseen, known, {n: b for n, b in task.bounds.items() if n in unseen},
             task.thorough, task.reach,
         )  # fmt: skip
         events = best.own_by_name(train) | held_score.own_by_name(held)
@@ -115,6 +117,11 @@ def _unseen_shapes(found: Fit) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+def _with_shapes_of(model: Model, other: Model, names: Sequence[str]) -> Model:
+    """Noise alone told these shapes: those of the other model are as good."""
+    return model.with_values({name: other.values[name] for name in names if name in other.values})
+
+
 def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
     """Values that these data sets have of their own beyond their initial motions."""
     several = {
@@ -125,9 +132,7 @@ def _own_count(found: Fit, data_sets: Sequence[DataSet]) -> int:
 
 
 def _best_fit(task: Task, train: Sequence[DataSet]) -> Fit:
-    if eventful(task):
-        return _event_fit(task, train)
-    best = _own_fit(task, train)
+    best = _event_fit(task, train) if eventful(task) else _own_fit(task, train)
     if task.base is None or best.misfit <= task.base.misfit:
         return best
     model = next(starting_models(task))
