@@ -15,8 +15,9 @@ from cg_dynamics.rollout.compiled import compile_model
 from cg_sysid.experiments.rehearsal import rehearse
 from cg_sysid.identification import descent
 from cg_sysid.identification.data_set import pieces, prepare
-from cg_sysid.identification.identify import fit, predict, score
-from cg_sysid.identification.simulation_error import attempt
+from cg_sysid.identification.identify import LEADING, fit, predict, score
+from cg_sysid.identification.simulation_error import Problem, attempt
+from cg_sysid.identification.unknowns import unknowns_of
 from cg_sysid.search import settings
 from cg_sysid.search.look import first_seconds, screen
 from cg_sysid.search.outcome import own_parameters
@@ -310,3 +311,35 @@ def test_steps_that_are_too_long_give_no_fit_up(model_file, monkeypatch):
     found = fit(nominal, data_sets, ['c5'], horizon=0.5, reach=1.1)
     assert found.normalised_error < 1.2
     assert found.values[0] == pytest.approx(machine.values['c5'], abs=5 * found.sigmas[0])
+
+
+def test_what_comes_later_is_not_moved_by_short_horizons(model_file):
+    pushed = Model.load(model_file).with_effect(
+        'external_push', impulse=0.0, instant=0.5, duration=0.1
+    )
+    data_sets = prepare(pushed, [_record(pushed, k) for k in range(2)])
+    late = np.array([0.7, 1.2])  # N s, s; its tail is 1e-9 of it at 0.2 s
+    guesses = [np.concatenate([data_set.motion, late]) for data_set in data_sets]
+    problem = Problem(pushed, data_sets, unknowns_of(pushed), guesses)
+    theta = np.array([u.to_coordinate(u.prior) for u in problem.unknowns])
+    ahead, alone = (
+        descent.minimise(problem, theta, guesses, 0.2, 1.0, 12, LEADING, np.inf, leading=leading)
+        for leading in (True, False)
+    )
+    for motion in ahead.motions:
+        np.testing.assert_array_equal(motion[-2:], late)
+    assert all((motion[-2:] != late).all() for motion in alone.motions)
+
+
+def test_a_push_in_a_record_held_out_alone_is_found(model_file):
+    """Records fitted to tell neither its duration nor anything else of it."""
+    nominal = Model.load(model_file)
+    machine = nominal.with_effect('external_push', impulse=1.6, instant=2.2, duration=0.08)
+    records = [_record(machine if k == 1 else nominal, k) for k in range(3)]
+    records = prepare(nominal, records)
+    train, held = records[::2], records[1::2]
+    base = try_candidate(Task(nominal), train, held)
+    outcome = try_candidate(Task(nominal, ('external_push', None), base=base.train), train, held)
+    assert outcome.train.misfit <= base.train.misfit
+    assert outcome.held.normalised_error < 1.2  # noise alone gives 1, within a few percent
+    assert [*outcome.events['record_1'].values()] == pytest.approx([1.6, 2.2], rel=0.02)
