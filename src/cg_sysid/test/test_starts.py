@@ -318,7 +318,7 @@ def test_what_comes_later_is_not_moved_by_short_horizons(model_file):
         'external_push', impulse=0.0, instant=0.5, duration=0.1
     )
     data_sets = prepare(pushed, [_record(pushed, k) for k in range(2)])
-    late = np.array([0.7, 1.2])  # N s, s; its tail is 1e-9 of it at 0.2 s
+    late = np.array([0.7, 1.2])  # N s, s; at 0.2 s its tail is 2e-10 of its peak
     guesses = [np.concatenate([data_set.motion, late]) for data_set in data_sets]
     problem = Problem(pushed, data_sets, unknowns_of(pushed), guesses)
     theta = np.array([u.to_coordinate(u.prior) for u in problem.unknowns])

@@ -133,7 +133,8 @@ def with_likes(
 
     What every joint lacks was taken up at all of them at once, and what came later may have
     hidden the law of one. What every joint has takes the place of what few have where the
-    torques cannot tell, and what is simpler that of what does not earn its numbers beside it.
+    torques cannot tell. What is simpler takes the place of a law whose further numbers earn
+    nothing.
 
     Returns:
         The laws and the base with another law; None where none does better.
@@ -168,7 +169,11 @@ def _advantage(
     law: Law,
     independent: tuple[np.ndarray, np.ndarray],
 ) -> float:
-    """Nats for what is like a law of the base; none where it should not take its place."""
+    """Nats that speak for what is like a law of the base; 0 where the law is to stay.
+
+    What is simpler loses evidence, however little. It has the margin by which laws are told apart
+    where the law's further numbers do not earn as much as any law has to.
+    """
     rare = not at_every_joint(base.model.effect(law.label))
     spared = len(base.said.values) - len(there.said.values)
     if rare and spared > 0:

@@ -118,7 +118,7 @@ def _unseen_shapes(found: Fit) -> tuple[str, ...]:
 
 
 def _with_shapes_of(model: Model, other: Model, names: Sequence[str]) -> Model:
-    """Noise alone told these shapes: those of the other model are as good."""
+    """The model with shapes of another: of these the records fitted to tell nothing but noise."""
     return model.with_values({name: other.values[name] for name in names if name in other.values})
 
 
